@@ -124,11 +124,11 @@ def test_what_is_not_finite_is_never_written(tmp_path, value):
 def test_what_fits_is_read_as_it_was_written(folder, config, step):
     header, arrays = contents(config, step)
     write_run(folder, config, header, arrays)
-    found_header, found = load_run_state(folder, load_config(folder.config))
-    assert found_header == {"format": FORMAT, **header} and found.keys() == arrays.keys()
+    loaded_header, loaded = load_run_state(folder, load_config(folder.config))
+    assert loaded_header == {"format": FORMAT, **header} and loaded.keys() == arrays.keys()
     for name, array in arrays.items():
-        assert found[name].dtype == (np.float32 if array.dtype == np.float16 else array.dtype)
-        np.testing.assert_array_equal(found[name], array)
+        assert loaded[name].dtype == (np.float32 if array.dtype == np.float16 else array.dtype)
+        np.testing.assert_array_equal(loaded[name], array)
 
 
 @pytest.mark.parametrize(
@@ -233,14 +233,14 @@ def test_coefficients_of_a_finished_run_are_rounded_and_of_no_other(folder, conf
     header, arrays = contents(config, STEPS)
     names = [name for name in arrays if name.startswith("points.sh")]
     rng = np.random.default_rng(8)
-    given = {name: rng.normal(0, 3, arrays[name].shape).astype(np.float32) for name in names}
-    write_run(folder, config, header, arrays | given)
-    stored, found = load_checkpoint(folder.checkpoint)[1], load_run_state(folder, config)[1]
+    coefficients = {name: rng.normal(0, 3, arrays[name].shape).astype(np.float32) for name in names}
+    write_run(folder, config, header, arrays | coefficients)
+    stored, loaded = load_checkpoint(folder.checkpoint)[1], load_run_state(folder, config)[1]
     assert len(names) == 3
     for name in names:
-        assert stored[name].dtype == np.float16 and found[name].dtype == np.float32
-        np.testing.assert_array_equal(found[name], given[name].astype(np.float16))
-    large = arrays | {names[0]: np.full_like(given[names[0]], 1e5)}
+        assert stored[name].dtype == np.float16 and loaded[name].dtype == np.float32
+        np.testing.assert_array_equal(loaded[name], coefficients[name].astype(np.float16))
+    large = arrays | {names[0]: np.full_like(coefficients[names[0]], 1e5)}
     with pytest.raises(Diverged, match="points.sh0 holds NaN or Inf"):
         save_checkpoint(folder.checkpoint, header, large)
     header, arrays = contents(config)
@@ -311,8 +311,8 @@ def test_a_training_does_not_go_on_from_it(scene, tmp_path, monkeypatch):
     header, arrays = load_checkpoint(file)
     header.pop("format")
     save_checkpoint(file, header, arrays | {"points.ids": arrays["points.ids"][::-1].copy()})
-    told = failure(*arguments(scene, tmp_path / "run"))
-    assert told.startswith(f"pp-cl: {file}: points.ids must be vertices of its grid in ascending")
+    error = failure(*arguments(scene, tmp_path / "run"))
+    assert error.startswith(f"pp-cl: {file}: points.ids must be vertices of its grid in ascending")
 
 
 def overflow(path):
@@ -337,5 +337,5 @@ def test_finite_weights_that_overflow_are_one_line(finished, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     shutil.copytree(finished, "run")
     overflow(tmp_path / "run" / "checkpoint.npz")
-    told = failure(words[0], "run", *words[1:])
-    assert "run/checkpoint.npz: its parameters are so large that the image holds NaN" in told
+    error = failure(words[0], "run", *words[1:])
+    assert "run/checkpoint.npz: its parameters are so large that the image holds NaN" in error

@@ -90,8 +90,8 @@ def test_a_further_interrupt_shows_no_traceback(told, then, status):
 def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(monkeypatch):
     errors = [ImportError("x.so: failed to map segment from shared object"), ImportError("x")]
     monkeypatch.setattr("pp_cl.commands.devices.run", lambda _: (_ for _ in ()).throw(errors[0]))
-    told = failure("devices")
-    assert "x.so" in told and "memory" in told
+    error = failure("devices")
+    assert "x.so" in error and "memory" in error
     del errors[0]
     with pytest.raises(ImportError):
         main(["devices"])

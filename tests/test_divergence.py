@@ -65,6 +65,6 @@ def test_a_training_that_diverges_at_its_end_is_not_finished(scene, tmp_path, mo
 
 def test_a_training_that_diverges_before_its_first_checkpoint(scene, tmp_path, monkeypatch):
     _poison(monkeypatch, 3, "points")
-    told = failure(*arguments(scene, tmp_path / "run"))
-    assert "at step 4 (loss, l1, ssim, psnr); nothing was kept: train into" in told
+    error = failure(*arguments(scene, tmp_path / "run"))
+    assert "at step 4 (loss, l1, ssim, psnr); nothing was kept: train into" in error
     assert not (tmp_path / "run" / "checkpoint.npz").exists()

@@ -54,8 +54,8 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
     for file in (own, killed):
         file.write_bytes(b"")
     assert main(["eval", str(run), "--save-images"]) == 0
-    left = [p.name for p in sorted((run / "eval" / "images").rglob("*"))]
-    assert left == ["own.png", "r_0.png", "r_1.png"]
+    files_left = [p.name for p in sorted((run / "eval" / "images").rglob("*"))]
+    assert files_left == ["own.png", "r_0.png", "r_1.png"]
     own.unlink()
 
 
@@ -73,9 +73,9 @@ def test_another_scene_is_refused_and_nothing_written(run, tmp_path):
     before = (run / "eval" / "metrics.json").read_bytes()
     other = write_ball_scene(tmp_path / "other", size=60, views=7)
     changed = changed_scene(run, tmp_path, "train", "r_0.png")
-    for scene, told in ((other, "other names or cameras"), (changed, "train/r_0.png: other pix")):
+    for scene, reason in ((other, "other names or cameras"), (changed, "train/r_0.png: other pix")):
         error = failure("eval", run, "--scene", scene)
-        assert "checkpoint.npz: belongs to another scene" in error and told in error
+        assert "checkpoint.npz: belongs to another scene" in error and reason in error
     assert (run / "eval" / "metrics.json").read_bytes() == before
 
 
@@ -83,8 +83,8 @@ def test_a_scene_without_training_views_is_measured_with_one_line(run, tmp_path,
     scene = changed_scene(run, tmp_path, "train", "r_1.png")
     (tmp_path / "ball" / "transforms_train.json").unlink()
     assert main(["eval", str(run), "--scene", scene]) == 0
-    [told] = capsys.readouterr().err.splitlines()
-    assert "cannot be compared with the scene of" in told and "no split train" in told
+    [line] = capsys.readouterr().err.splitlines()
+    assert "cannot be compared with the scene of" in line and "no split train" in line
 
 
 def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, monkeypatch):

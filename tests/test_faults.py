@@ -90,14 +90,14 @@ class Bench:
 
     def left(self, name, *, may_leave=False):
         _, words, expected = self.commands[name]
-        left = leftovers(self.run)
-        wrong = half_written(self.run) + ([] if may_leave else left)
+        files_left = leftovers(self.run)
+        wrong = half_written(self.run) + ([] if may_leave else files_left)
         files = frozenset(content(self.run).items())
-        if (name, files, bool(left)) not in self._seen:
+        if (name, files, bool(files_left)) not in self._seen:
             after = run_command(words)[1] + differences(self.run, expected) + leftovers(self.run)
             wrong += [f"the next start: {line}" for line in after]
             if not after:
-                self._seen.add((name, files, bool(left)))
+                self._seen.add((name, files, bool(files_left)))
         return wrong
 
 
@@ -126,13 +126,13 @@ def test_a_call_that_fails(bench, name, part):
         restore(bench.run, begin)
         code, stays = ((errno.EIO, False), (errno.ENOSPC, True))[number % 2]
         with Faults(bench.run, number, code, stays=stays) as faults:
-            status, found = run_command(words, bench.run)
+            status, problems = run_command(words, bench.run)
         assert len(faults.calls) >= number
         if status == 0:
-            found += differences(bench.run, expected)
+            problems += differences(bench.run, expected)
         kind = faults.calls[number - 1].split()[0]
-        found += bench.left(name, may_leave=kind in ("unlink", "rmdir"))
-        wrong += [f"call {number} ({faults.calls[number - 1]}): {line}" for line in found]
+        problems += bench.left(name, may_leave=kind in ("unlink", "rmdir"))
+        wrong += [f"call {number} ({faults.calls[number - 1]}): {line}" for line in problems]
     assert wrong == []
 
 

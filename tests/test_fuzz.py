@@ -162,9 +162,11 @@ class World:
                 yield folder
         finally:
             signal.alarm(0)
-        for told in caught:
-            assert told.category is UserWarning and re.search("pp_cl|fuzz", told.filename), told
-            check_line(str(told.message))
+        for warning in caught:
+            assert warning.category is UserWarning and re.search("pp_cl|fuzz", warning.filename), (
+                warning
+            )
+            check_line(str(warning.message))
 
 
 @pytest.fixture(scope="module")
@@ -471,10 +473,10 @@ def test_a_mesh(world, data):
         assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
         surface = taken(lambda: sample_surface(world.device, mesh, grid, 2000))
         if surface is not None:
-            found = overlap(surface, grid, np.arange(9**3))
+            scores = overlap(surface, grid, np.arange(9**3))
             assert 0 < surface.count <= 2000
-            assert found.pop("points") == 9**3
-            assert all(0 <= share <= 1 for share in found.values())
+            assert scores.pop("points") == 9**3
+            assert all(0 <= share <= 1 for share in scores.values())
 
 
 @fuzzed()

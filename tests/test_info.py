@@ -39,35 +39,37 @@ def facts(capsys):
 
 
 def test_a_run_says_what_its_files_say(scene, finished, facts):
-    found = facts(finished)
+    info = facts(finished)
     header, arrays = load_checkpoint(finished / "checkpoint.npz")
     log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
-    assert found["preset"] == "tiny" and found["scene"] == scene and found["downscale"] == 2
-    assert (found["step"], found["iterations"], found["finished"]) == (60, 60, True)
-    initial, left = header["initial_points"], len(arrays["points.ids"])
-    pruned = found["points"].pop("pruned")
-    assert found["points"] == {"initial": initial, "left": left}
-    assert sorted(pruned, reverse=True) == pruned and pruned[-1] == left and pruned[0] < initial
+    assert info["preset"] == "tiny" and info["scene"] == scene and info["downscale"] == 2
+    assert (info["step"], info["iterations"], info["finished"]) == (60, 60, True)
+    initial, points_left = header["initial_points"], len(arrays["points.ids"])
+    pruned = info["points"].pop("pruned")
+    assert info["points"] == {"initial": initial, "left": points_left}
+    assert (
+        sorted(pruned, reverse=True) == pruned and pruned[-1] == points_left and pruned[0] < initial
+    )
     whole, size = math.prod(header["grid"]["dims"]), (finished / "checkpoint.npz").stat().st_size
     bytes_of_point = 4 + 4 * 4 + 4 * 9 + 2 * 9 * 16
-    assert found["cells"] == {
+    assert info["cells"] == {
         "box": whole,
         "hull": initial,
-        "left": left,
+        "left": points_left,
         "checkpoint_bytes": size,
-        "box_bytes": size + (whole - left) * bytes_of_point,
+        "box_bytes": size + (whole - points_left) * bytes_of_point,
     }
-    assert found["work"] is None
-    assert found["grid"]["dims"] == header["grid"]["dims"]
+    assert info["work"] is None
+    assert info["grid"]["dims"] == header["grid"]["dims"]
     # images are 24 pixels wide, at an angle of view of 0.7, from a distance of 4
     pixels = 12 / math.tan(0.35) * header["grid"]["voxel_size"] / 4
-    assert found["grid"]["voxel_size_pixels"] == pytest.approx(pixels, rel=0.02)
-    assert found["files"]["checkpoint.npz"] == (finished / "checkpoint.npz").stat().st_size
-    assert found["device"] == log[-1]["device"] and found["seconds"] == log[-1]["seconds"]
-    assert found["psnr"] == log[-2]["psnr"]
-    assert found["metrics"] == json.loads((finished / "eval/metrics.json").read_text())["mean"]
+    assert info["grid"]["voxel_size_pixels"] == pytest.approx(pixels, rel=0.02)
+    assert info["files"]["checkpoint.npz"] == (finished / "checkpoint.npz").stat().st_size
+    assert info["device"] == log[-1]["device"] and info["seconds"] == log[-1]["seconds"]
+    assert info["psnr"] == log[-2]["psnr"]
+    assert info["metrics"] == json.loads((finished / "eval/metrics.json").read_text())["mean"]
     parameters = sum(a.size for name, a in arrays.items() if name.startswith("net."))
-    assert found["network"] == {
+    assert info["network"] == {
         "widths": [16, 16, 16],
         "blocks": "single",
         "parameters": parameters,
@@ -75,7 +77,7 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
 
 
 def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
-    found = facts(finished, "--work")["work"]
+    work = facts(finished, "--work")["work"]
     run = load(finished, dev)
     counted = []
     for camera in evenly(run.cameras("train"), 8):
@@ -83,12 +85,12 @@ def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
         dropped = result.fragments().sum() - listed_fragments(result.pairs, result.weights)[0].sum()
         counted.append([result.fragments().sum(), dropped, len(result.weights.visible)])
     fragments, dropped, drawn = np.mean(counted, 0)
-    assert found["views"] == 8 and found["drawn"] == drawn
-    assert found["fragments"] == {"found": fragments, "blended": fragments - dropped}
+    assert work["views"] == 8 and work["drawn"] == drawn
+    assert work["fragments"] == {"found": fragments, "blended": fragments - dropped}
     # a crop covers the whole image, and each fragment has a gradient
     step = {"side": 24, "touched": drawn, "with_gradients": fragments - dropped}
-    assert found["step"] == step and 0 < dropped < fragments
-    network = found["network"]
+    assert work["step"] == step and 0 < dropped < fragments
+    network = work["network"]
     assert 0 < network["tiles"] < 1 and network["whole"] == network["multiplications"]
     side = 24 + 2 * MARGIN
     assert network["whole"] == multiplications(run.model.net.layers, side, side)
@@ -100,11 +102,11 @@ def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
 
 def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, monkeypatch):
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
-    found = facts(tmp_path / "run")
-    assert (found["step"], found["finished"], found["metrics"]) == (20, False, None)
+    info = facts(tmp_path / "run")
+    assert (info["step"], info["finished"], info["metrics"]) == (20, False, None)
     train_and_interrupt(scene, tmp_path / "young", 7, monkeypatch)
-    found = facts(tmp_path / "young")
-    assert found["step"] == 0 and found["points"] is None and found["seconds"] > 0
+    info = facts(tmp_path / "young")
+    assert info["step"] == 0 and info["points"] is None and info["seconds"] > 0
     assert main(["info", str(tmp_path / "young")]) == 0
 
 
@@ -129,25 +131,25 @@ def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
 
 
 def test_a_scene_says_what_is_in_it(scene, facts):
-    found = facts(scene)
-    assert found["format"] == "transforms" and list(found["splits"].items()) == [
+    info = facts(scene)
+    assert info["format"] == "transforms" and list(info["splits"].items()) == [
         ("train", 8),
         ("test", 2),
     ]
-    assert found["images"] == {"48x48": 10} and found["downscale"] == 1
+    assert info["images"] == {"48x48": 10} and info["downscale"] == 1
     focal = 24 / math.tan(0.35)
-    assert found["focal_pixels"] == pytest.approx([focal, focal])
-    assert found["field_of_view"]["x"] == pytest.approx([math.degrees(0.7)] * 2)
+    assert info["focal_pixels"] == pytest.approx([focal, focal])
+    assert info["field_of_view"]["x"] == pytest.approx([math.degrees(0.7)] * 2)
     share = np.pi * (BALL / math.sqrt(16 - BALL**2) * focal) ** 2 / 48**2
     share = pytest.approx(share, rel=0.02)
     agreeing = {"disagreeing": [], "left_out": {}, "forgiven": 0}
-    assert found["masks"] == {"with_alpha": 1.0, "object": share, **agreeing}
-    assert found["hull"]["refinements"] == 0
-    assert found["depth_range"] is None and found["problem"] is None
-    assert found["distances"] == pytest.approx([4, 4], abs=1e-6)
-    assert found["looked_at"] == pytest.approx([0, 0, 0], abs=1e-6)
-    assert found["up"] == pytest.approx([0, 0, 1], abs=1e-3)
-    hull = found["hull"]
+    assert info["masks"] == {"with_alpha": 1.0, "object": share, **agreeing}
+    assert info["hull"]["refinements"] == 0
+    assert info["depth_range"] is None and info["problem"] is None
+    assert info["distances"] == pytest.approx([4, 4], abs=1e-6)
+    assert info["looked_at"] == pytest.approx([0, 0, 0], abs=1e-6)
+    assert info["up"] == pytest.approx([0, 0, 1], abs=1e-3)
+    hull = info["hull"]
     assert 250_000 <= hull["points"] <= 255_000 and not hull["capped"]
     low, high = np.array(hull["box"])
     assert (low < -0.9 * BALL).all() and (high > 0.9 * BALL).all()
@@ -161,17 +163,17 @@ def test_a_scene_without_hull_has_an_image(tmp_path, facts, capsys):
     pixels[..., 3] = 0
     pixels[2:5, 2:5, 3] = 255
     Image.fromarray(pixels).save(last)
-    found = facts(scene, "--picture", tmp_path / "sheet.png")
-    assert found["hull"] is None and "the mask rejects every place" in found["problem"]
+    info = facts(scene, "--picture", tmp_path / "sheet.png")
+    assert info["hull"] is None and "the mask rejects every place" in info["problem"]
     image = read_rgba(tmp_path / "sheet.png")[..., :3]
     assert not (image == OUTLINE).all(-1).any()
     assert main(["info", str(scene)]) == 0
     assert "hull        none: " in capsys.readouterr().out
     for path in (*others, last):
         Image.open(path).convert("RGB").save(path)
-    found = facts(scene, "--picture", tmp_path / "sheet.png")
-    assert found["masks"]["with_alpha"] == 0 and found["masks"]["object"] is None
-    assert found["hull"]["points"] > 0, "they fill a box"
+    info = facts(scene, "--picture", tmp_path / "sheet.png")
+    assert info["masks"]["with_alpha"] == 0 and info["masks"]["object"] is None
+    assert info["hull"]["points"] > 0, "they fill a box"
     assert read_rgba(tmp_path / "sheet.png").shape[1] >= 4 * 48
 
 

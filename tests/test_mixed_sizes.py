@@ -65,8 +65,8 @@ def test_it_is_rendered_shown_and_exported(trained, tmp_path):
         main(["render", str(trained), "--path", "test", "--format", "png", "--out", str(out)]) == 0
     )
     assert [read_rgba(f).shape[1::-1] for f in sorted(out.glob("0*.png"))] == list(SIZES)
-    told = failure("render", trained, "--path", "test", "--format", "mp4")
-    assert "--path test: its images differ in size" in told
+    error = failure("render", trained, "--path", "test", "--format", "mp4")
+    assert "--path test: its images differ in size" in error
     for words in (
         ["info", str(trained), "--picture", str(tmp_path / "a.png")],
         ["export", str(trained), "--format", "scene", "--out", str(tmp_path / "s")],
@@ -84,7 +84,7 @@ def test_memory_is_planned_for_the_largest(dev, scene):
     hull = build_grid(dev, views, 400)
     net = UNet(dev, config.network.widths)
     frames = scene_frames(scene)
-    orders = frames, frames[::-1], [max(frames, key=lambda one: one.camera.width)] * len(frames)
+    orders = frames, frames[::-1], [max(frames, key=lambda view: view.camera.width)] * len(frames)
     mixed, turned, largest = (
         MemoryPlan(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
     )

@@ -75,8 +75,8 @@ def test_what_is_the_users_stays(work, scene, name, capsys):
 
     def again(earlier):
         status, lines = spoken(words)
-        told = [line for line in lines if line.startswith("pp-cl: ")]
-        assert (status, len(told)) in ((0, 0), (2, 1)), lines
+        errors = [line for line in lines if line.startswith("pp-cl: ")]
+        assert (status, len(errors)) in ((0, 0), (2, 1)), lines
         assert {path: files(work).get(path) for path in earlier} == earlier
 
     again(beside)
@@ -98,7 +98,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_left(work, scene, name, monkeypa
         patch.setattr(os, "fsync", full)
         patch.setattr(os, "replace", full)
         status, lines = spoken(words)
-    told = [line for line in lines if line.startswith("pp-cl: ")]
-    assert status == 2 and len(told) == 1 and "space" in told[0] and ".tmp" not in told[0]
+    errors = [line for line in lines if line.startswith("pp-cl: ")]
+    assert status == 2 and len(errors) == 1 and "space" in errors[0] and ".tmp" not in errors[0]
     assert not list(work.rglob(".*.tmp*"))
     assert main(words) == 0

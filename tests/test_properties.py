@@ -45,13 +45,13 @@ def given_settings(draw):
     key, item = draw(st.sampled_from(SETTINGS))
     limits, several = item.metadata, isinstance(item.default, tuple)
     kind = type(item.default[0]) if several else type(item.default)
-    one = {
+    strategy = {
         bool: st.booleans(),
         str: st.sampled_from(limits["choices"] or [item.default]),
         int: st.integers(*(math.floor(limits[k] or 0) for k in ("least", "most"))),
         float: st.floats(*(float(limits[k] or 0) for k in ("least", "most"))),
     }[kind]
-    value = draw(st.tuples(*[one] * len(item.default)) if several else one)
+    value = draw(st.tuples(*[strategy] * len(item.default)) if several else strategy)
     return key, value
 
 
@@ -93,7 +93,7 @@ def test_numbers_in_a_text_come_back_exactly(tmp_path, rows):
 def test_a_checkpoint_comes_back(tmp_path, stored):
     stored = {f"x.{name}": array for name, array in stored.items()}
     save_checkpoint(tmp_path / "a.npz", {"step": 1}, stored)
-    header, found = load_checkpoint(tmp_path / "a.npz")
-    assert header == {"format": FORMAT, "step": 1} and found.keys() == stored.keys()
+    header, loaded = load_checkpoint(tmp_path / "a.npz")
+    assert header == {"format": FORMAT, "step": 1} and loaded.keys() == stored.keys()
     for name, array in stored.items():
-        assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
+        assert loaded[name].dtype == array.dtype and np.array_equal(loaded[name], array)

@@ -18,11 +18,11 @@ WITHIN = 0.3  # dB
 @pytest.mark.parametrize("name", REACHED)
 def test_the_preset_tiny_is_as_good_as_it_was(tmp_path, name):
     scene = name if name == "demo" else write_ball_scene(tmp_path / name, views=24, size=128)
-    found = []
+    psnrs = []
     for seed in map(str, SEEDS):
         out = str(tmp_path / seed)
         assert main(["train", scene, "--iterations", "300", "--seed", seed, "--out", out]) == 0
         assert main(["eval", out]) == 0
         metrics = json.loads((tmp_path / seed / "eval/metrics.json").read_text())
-        found.append(metrics["mean"]["psnr"])
-    assert np.mean(found) == pytest.approx(REACHED[name], abs=WITHIN)
+        psnrs.append(metrics["mean"]["psnr"])
+    assert np.mean(psnrs) == pytest.approx(REACHED[name], abs=WITHIN)

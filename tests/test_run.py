@@ -63,12 +63,12 @@ def test_depths_of_drawn_pixels_stay_on_the_surface(trained, monkeypatch):
     for side in (1, 2):
         monkeypatch.setattr(run.renderer, "supersampling", side)
         views.append(run.render(camera))
-    one, four = views
+    single, four = views
     np.testing.assert_array_equal(four.alpha == 0, np.isinf(four.depth))
-    both = np.minimum(one.alpha, four.alpha) > 0.9
-    apart = np.abs(one.median_depth[both] - four.median_depth[both])
+    both = np.minimum(single.alpha, four.alpha) > 0.9
+    apart = np.abs(single.median_depth[both] - four.median_depth[both])
     assert both.sum() > 20 and np.median(apart) < 0.2 * run.model.grid.voxel_size
-    assert abs(one.alpha.mean() - four.alpha.mean()) < 0.02
+    assert abs(single.alpha.mean() - four.alpha.mean()) < 0.02
 
 
 def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_path):

@@ -58,8 +58,8 @@ def test_each_setting_has_a_row(whole, dev, tmp_path):
         assert 0 < row["ms_range"][0] <= row["ms"] <= row["ms_range"][1]
         assert 0 <= row["mean_err"] <= row["max_err"] <= 1 and row["psnr"] > 5
     (default,) = (row for row in rows if row["is_default"])
-    found = evaluate_run(load(folder, dev), out=tmp_path / "eval")["mean"]
-    assert {name: default[name] for name in found} == pytest.approx(found)
+    mean = evaluate_run(load(folder, dev), out=tmp_path / "eval")["mean"]
+    assert {name: default[name] for name in mean} == pytest.approx(mean)
     assert sum(row["is_fast"] for row in rows) == 1
     assert {row["knob"] for row in rows} >= {"early_stop", "samples", "points", "convolutions"}
     for row in (row for row in rows if row["knob"] == "convolutions"):
@@ -84,8 +84,8 @@ def test_the_table_names_default_and_frontier(whole, capsys):
 
 
 def row(ms, psnr, early_stop=0.01, least=None, **more):
-    found = {"ms": ms, "ms_range": [least or ms - 1, ms + 1], "psnr": psnr, "is_default": False}
-    return found | {"setting": {"early_stop": early_stop, "samples": 4}} | more
+    fields = {"ms": ms, "ms_range": [least or ms - 1, ms + 1], "psnr": psnr, "is_default": False}
+    return fields | {"setting": {"early_stop": early_stop, "samples": 4}} | more
 
 
 def test_the_fastest_row_is_hardly_worse_than_the_default():
@@ -98,8 +98,8 @@ def test_the_fastest_row_is_hardly_worse_than_the_default():
 
 
 def curve(axes, label):
-    (found,) = (line.get_xydata().tolist() for line in axes.lines if line.get_label() == label)
-    return found
+    (points,) = (line.get_xydata().tolist() for line in axes.lines if line.get_label() == label)
+    return points
 
 
 def test_a_curve_for_each_knob_goes_through_the_default(whole, tmp_path):
@@ -118,9 +118,9 @@ def test_what_is_fastest_is_kept_until_the_checkpoint_changes(run, dev, unmeasur
     file = run.folder.frontier
     kept = json.loads(file.read_text())
     # mark the row with half of the points as the fastest, whichever it was
-    chosen = next(one for one in kept["rows"] if one["setting"]["points"] == 0.5)
-    for one in kept["rows"]:
-        one["is_fast"] = one is chosen
+    chosen = next(row for row in kept["rows"] if row["setting"]["points"] == 0.5)
+    for row in kept["rows"]:
+        row["is_fast"] = row is chosen
     file.write_text(json.dumps(kept))
     fast, line = fastest(run)
     assert "50% of the points" in line and f"{chosen['psnr']:.2f} dB" in line
@@ -144,8 +144,8 @@ def test_what_is_fastest_is_kept_until_the_checkpoint_changes(run, dev, unmeasur
 
 def test_a_run_that_is_fastest_as_it_is_says_so(run, unmeasured):
     kept = json.loads(run.folder.frontier.read_text())
-    for one in kept["rows"]:
-        one["is_fast"] = one["is_default"]
+    for row in kept["rows"]:
+        row["is_fast"] = row["is_default"]
     run.folder.frontier.write_text(json.dumps(kept))
     fast, line = fastest(run)
     assert fast is run and "no setting is 1.1 times as fast as the default" in line
@@ -186,9 +186,9 @@ def test_members_are_dropped_one_after_the_other(run, dev):
 
 def test_only_finished_runs_are_measured(scene, tmp_path, monkeypatch):
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
-    told = f"{tmp_path / 'run'}: is at step 20 of 60; finish it first with `pp-cl train --out"
-    assert told in failure("bench", tmp_path / "run")
-    assert told in failure("render", tmp_path / "run", "--fast")
+    message = f"{tmp_path / 'run'}: is at step 20 of 60; finish it first with `pp-cl train --out"
+    assert message in failure("bench", tmp_path / "run")
+    assert message in failure("render", tmp_path / "run", "--fast")
 
 
 def test_a_file_of_the_users_is_not_replaced(run):

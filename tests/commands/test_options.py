@@ -57,9 +57,9 @@ def test_no_other_file_becomes_json(tmp_path):
 
 
 def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
-    def talk(given):
-        print("measuring", given.subject)
-        options.write_json_option(given.json, {"a": 1})
+    def talk(parsed):
+        print("measuring", parsed.subject)
+        options.write_json_option(parsed.json, {"a": 1})
 
     monkeypatch.setattr("pp_cl.commands.info.run", talk)
     assert main(["info", str(tmp_path), "--json"]) == 0
@@ -77,8 +77,8 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
     ],
 )
 def test_an_empty_value_is_refused(words, capsys):
-    for given in ((*words, ""), (*words[:-1], f"{words[-1]}=")):
-        assert main(given) == 2
+    for argv in ((*words, ""), (*words[:-1], f"{words[-1]}=")):
+        assert main(argv) == 2
         error = capsys.readouterr().err
         assert f"{words[-1]}: is empty" in error and error.count("\n") == 1
 
@@ -97,11 +97,11 @@ def test_an_empty_value_is_refused(words, capsys):
 def test_options_whose_value_may_be_left_out(tmp_path, monkeypatch, words, found):
     """Options take the word after them. Without a word, --json prints and --metrics means all."""
     monkeypatch.chdir(tmp_path)
-    given = {}
-    monkeypatch.setattr("pp_cl.commands.compare.run", lambda options: given.update(vars(options)))
+    parsed = {}
+    monkeypatch.setattr("pp_cl.commands.compare.run", lambda options: parsed.update(vars(options)))
     assert main(["compare", *words.split()]) == 0
-    given["json"] = None if given["json"] is sys.stdout else given["json"]
-    assert {name: given[name] for name in found} == found
+    parsed["json"] = None if parsed["json"] is sys.stdout else parsed["json"]
+    assert {name: parsed[name] for name in found} == found
 
 
 @pytest.mark.parametrize(

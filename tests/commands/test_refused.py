@@ -173,9 +173,9 @@ def check_refused(words, named, folder, capsys):
     """Check that the last line names what is wrong and the working folder is unchanged."""
     before = sorted(folder.rglob("*"))
     assert main(words) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert [text for text in said if text.startswith("pp-cl")] == said[-1:]
-    assert named in said[-1]
+    lines = capsys.readouterr().err.splitlines()
+    assert [text for text in lines if text.startswith("pp-cl")] == lines[-1:]
+    assert named in lines[-1]
     assert sorted(folder.rglob("*")) == before
 
 

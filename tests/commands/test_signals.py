@@ -40,8 +40,10 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_to_the_same_bytes(
     with monkeypatch.context() as patch:
         signalling(patch, steps, number)
         assert main(arguments(scene, out)) == status
-    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
-    assert len(told) == 1 and "the same command goes on" in told[0] and f"step {steps};" in told[0]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
+    assert (
+        len(lines) == 1 and "the same command goes on" in lines[0] and f"step {steps};" in lines[0]
+    )
     header, _ = load_checkpoint(out / "checkpoint.npz")
     assert header["step"] == steps and not header["finished"]
     assert signal.getsignal(number) is before

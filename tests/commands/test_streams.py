@@ -44,7 +44,7 @@ def test_streams_that_are_closed():
         )
         for closed in (">&-", "2>&-")
     ]
-    assert [one.returncode for one in done] == [2, 2]
+    assert [process.returncode for process in done] == [2, 2]
     assert done[0].stderr.splitlines() == [NO_RUN] and done[1].stderr == b""
 
 

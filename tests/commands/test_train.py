@@ -28,8 +28,8 @@ def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
     chosen = f"{line} for the preset tiny (--downscale 1 keeps them)"
     assert chosen in trained_lines(capsys, scene, "--out", out)
     assert json.loads((out / "config.json").read_text())["scene"]["downscale"] == 2
-    given = ("--set", "scene.downscale=1")
-    assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *given)
+    option = ("--set", "scene.downscale=1")
+    assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *option)
 
 
 def test_a_full_disk_is_told_before_the_first_step(scene, tmp_path, monkeypatch):
@@ -69,8 +69,8 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
     for name in ("checkpoint.npz", "config.json"):
         assert (out / name).read_bytes() == (plain / name).read_bytes()
     assert not (out / "previews" / "step_000001.png").exists()
-    told = failure(*arguments(scene, out, **words), "--preset", "tiny")
-    assert "preset is small in this run" in told
+    error = failure(*arguments(scene, out, **words), "--preset", "tiny")
+    assert "preset is small in this run" in error
 
 
 def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
@@ -85,8 +85,8 @@ def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
     config = run_config(folder, scene)
     assert (config.train.refine_at, config.raster.radius) == ((0, 0), 0)
     assert config.train.view_opacity == "auto"
-    _, given = begin_with(folder.config, [])
-    assert not {*AUTOMATIC} & {key for key, _, _ in given}
+    _, settings = begin_with(folder.config, [])
+    assert not {*AUTOMATIC} & {key for key, _, _ in settings}
     own = [("raster.radius", "0.9", "--set")]
     assert run_config(folder, scene, None, own).raster.radius == 0.9
 
@@ -103,18 +103,18 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
     tmp_path, monkeypatch
 ):
     """Otherwise, if the process is killed in between, they would be missing for ever."""
-    scene, folder, found = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run"), {}
+    scene, folder, written = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run"), {}
 
     def saving(path, header, arrays):
         rows = [json.loads(line) for line in folder.log.read_text().splitlines()]
         images = sorted(int(path.stem[5:]) for path in folder.previews.iterdir())
-        found[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), images[-1:]
+        written[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), images[-1:]
         save_checkpoint(path, header, arrays)
 
     monkeypatch.setattr("pp_cl.session.training.save_checkpoint", saving)
     monkeypatch.setattr("pp_cl.session.training.PREVIEWS", 3)
     assert main(arguments(scene, folder.path, train__checkpoint_every=20)) == 0
-    assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}
+    assert written == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}
 
 
 def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):

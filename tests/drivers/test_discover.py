@@ -31,9 +31,9 @@ def listed(monkeypatch):
 
 
 def test_listed_devices_are_probed(session_device):
-    found = list_devices()
-    (index,) = (i for i, d, p in found if d == session_device.device and p is None)
-    assert len({i for i, _, _ in found}) == len(found)
+    devices = list_devices()
+    (index,) = (i for i, d, p in devices if d == session_device.device and p is None)
+    assert len({i for i, _, _ in devices}) == len(devices)
     assert open_device(index).device == session_device.device
 
 
@@ -141,9 +141,9 @@ def test_a_cache_folder_in_which_nothing_runs_is_replaced(tmp_path, monkeypatch)
         monkeypatch.setenv(name, str(folder))
     flags = {str(folder): SimpleNamespace(f_flag=os.ST_NOEXEC) for folder in caches.values()}
     monkeypatch.setattr(os, "statvfs", lambda p: flags.get(str(p), SimpleNamespace(f_flag=0)))
-    with pytest.warns(UserWarning, match="is mounted noexec") as told:
+    with pytest.warns(UserWarning, match="is mounted noexec") as warned:
         drivers._give_cache()
-    for name, warning in zip(caches, told, strict=True):
+    for name, warning in zip(caches, warned, strict=True):
         assert os.environ[name] in str(warning.message) and os.environ[name] != str(caches[name])
 
 

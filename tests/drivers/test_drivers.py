@@ -60,15 +60,15 @@ def test_drivers_that_crash_and_one_that_builds_nothing(vendors, tmp_path):
     vendors("crash", "-DCRASHES")
     vendors("late", "-DCRASHES_IN_BUILD")
     vendors("broken")
-    found = listed()
-    assert "SIGABRT" in found["crash.icd"]["problem"] and "SIGABRT" in found["late.icd"]["problem"]
-    assert found["unbuilding"]["problem"].startswith("does not run")
-    assert [row["index"] for row in found.values() if row["problem"] is None]
+    rows = listed()
+    assert "SIGABRT" in rows["crash.icd"]["problem"] and "SIGABRT" in rows["late.icd"]["problem"]
+    assert rows["unbuilding"]["problem"].startswith("does not run")
+    assert [row["index"] for row in rows.values() if row["problem"] is None]
     # later processes try no driver and load no harmful one, until a new driver is added
     opened = "from pp_cl import drivers; {} print(drivers.open_device().name)"
-    assert python(opened.format("drivers._probe = None;")).strip() in found
+    assert python(opened.format("drivers._probe = None;")).strip() in rows
     vendors("other", "-DCRASHES")
-    assert python(opened.format("")).strip() in found
+    assert python(opened.format("")).strip() in rows
     # the results about the drivers before are still kept
     kept = sorted(file.read_text().count("other.icd") for file in (tmp_path / "cache").iterdir())
     assert kept == [0, 1]
@@ -80,14 +80,14 @@ def test_a_driver_that_hangs(vendors):
     vendors("hang", "-DHANGS")
     vendors("broken")
     start = time.monotonic()
-    found = listed()
+    rows = listed()
     assert time.monotonic() - start < 60  # 20 s for the driver that hangs, then all others again
-    assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
-    assert "20 seconds" in found["hang.icd"]["problem"]
-    left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
+    assert {"crash.icd", "hang.icd", "unbuilding"} < set(rows)
+    assert "20 seconds" in rows["hang.icd"]["problem"]
+    commands = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
     library = str(Path(os.environ["OCL_ICD_VENDORS"]).with_name("libhang.so"))
-    assert not [words for words in left if library in " ".join(words)]
-    assert [row["index"] for row in found.values() if row["problem"] is None]
+    assert not [words for words in commands if library in " ".join(words)]
+    assert [row["index"] for row in rows.values() if row["problem"] is None]
 
 
 def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
@@ -114,16 +114,16 @@ def test_what_was_found_is_kept_and_found_anew_where_its_file_is_damaged(
     def tried(cache):
         monkeypatch.setenv("PP_CACHE", str(cache))
         drivers._tried.clear()
-        found, count = drivers.try_drivers(), len(probed)
-        rows = {tuple(row[:3]): row[3] for row in found["devices"]}
+        result, count = drivers.try_drivers(), len(probed)
+        rows = {tuple(row[:3]): row[3] for row in result["devices"]}
         assert rows[drivers.identity(session_device.device)] is None
         return count
 
     assert tried(tmp_path) == tried(tmp_path) == 1
     (file,) = tmp_path.iterdir()
-    found = json.loads(file.read_text())
-    broken = found | {"devices": [[*row[:3], "broken"] for row in found["devices"]]}
-    damaged = [found | {"devices": 1}, found | {"devices": [[]]}, found | {"left_out": []}]
+    stored = json.loads(file.read_text())
+    broken = stored | {"devices": [[*row[:3], "broken"] for row in stored["devices"]]}
+    damaged = [stored | {"devices": 1}, stored | {"devices": [[]]}, stored | {"left_out": []}]
     for n, content in enumerate([[], {}, *damaged, broken], 2):
         file.write_text(json.dumps(content))
         assert tried(tmp_path) == n

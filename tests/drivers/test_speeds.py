@@ -28,9 +28,9 @@ def measured(monkeypatch, tmp_path):
 
     monkeypatch.setattr(speeds, "_measured", measure)
 
-    def sets(found, *values):
+    def sets(rows, *values):
         now.clear()
-        now.update(zip(map(speeds._key, [one[1] for one in found]), values, strict=True))
+        now.update(zip(map(speeds._key, [row[1] for row in rows]), values, strict=True))
         return counts
 
     return sets
@@ -41,67 +41,67 @@ def first(found):
 
 
 def test_the_fastest_is_taken_and_measured_once(measured):
-    found = [fake("A", "cpu"), fake("B", "gpu", gpu=True, index="1:0"), fake("C", "c", index="2:0")]
-    counts = measured(found, 5.0, 7.0, 6.0)
-    assert first(found) == "1:0"
-    measured(found, 9.0, 1.0, 1.0)  # another result, which must not be measured
-    assert first(found) == first(found[::-1]) == "1:0" and counts == [1]
-    assert first(found[:1]) == "0:0" and first([found[0], found[2]]) == "2:0" and counts == [1]
+    rows = [fake("A", "cpu"), fake("B", "gpu", gpu=True, index="1:0"), fake("C", "c", index="2:0")]
+    counts = measured(rows, 5.0, 7.0, 6.0)
+    assert first(rows) == "1:0"
+    measured(rows, 9.0, 1.0, 1.0)  # another result, which must not be measured
+    assert first(rows) == first(rows[::-1]) == "1:0" and counts == [1]
+    assert first(rows[:1]) == "0:0" and first([rows[0], rows[2]]) == "2:0" and counts == [1]
 
 
 def test_another_version_is_measured_anew(measured):
-    found = [fake("A", "a"), fake("B", "b", index="1:0")]
-    counts = measured(found, 5.0, 1.0)
-    assert first(found) == "0:0"
-    newer = [found[0], fake("B", "b", index="1:0", version="2")]
+    rows = [fake("A", "a"), fake("B", "b", index="1:0")]
+    counts = measured(rows, 5.0, 1.0)
+    assert first(rows) == "0:0"
+    newer = [rows[0], fake("B", "b", index="1:0", version="2")]
     measured(newer, 5.0, 6.0)
     assert first(newer) == "1:0" and counts == [1, 2]
-    assert first(found) == "0:0" and counts == [1, 2]  # in an environment with the older driver
+    assert first(rows) == "0:0" and counts == [1, 2]  # in an environment with the older driver
 
 
 def test_intels_driver_goes_before_another_of_cpus_that_is_not_clearly_faster(measured):
-    found = [fake(POCL, "cpu-Xeon"), fake(INTEL, "Xeon", index="1:0")]
-    measured(found, 99.0 * CLEARLY, 100.0)
-    assert first(found) == "1:0"
-    newer = [found[0], fake(INTEL, "Xeon", index="1:0", version="2")]
+    rows = [fake(POCL, "cpu-Xeon"), fake(INTEL, "Xeon", index="1:0")]
+    measured(rows, 99.0 * CLEARLY, 100.0)
+    assert first(rows) == "1:0"
+    newer = [rows[0], fake(INTEL, "Xeon", index="1:0", version="2")]
     measured(newer, 101.0 * CLEARLY, 100.0)
     assert first(newer) == "0:0"
     gpu = fake("A", "gpu", gpu=True, index="2:0")
-    measured([*found, gpu], 1.0, 100.0, 101.0)
-    assert first([*found, gpu]) == "2:0"
+    measured([*rows, gpu], 1.0, 100.0, 101.0)
+    assert first([*rows, gpu]) == "2:0"
 
 
 def test_what_does_not_work_or_cannot_be_measured_is_not_taken(measured):
-    found = [fake("A", "a"), fake("B", "b", index="1:0", problem="does not run: x")]
-    counts = measured(found, 1.0, 2.0)
-    assert first(found) == "0:0" and counts == []  # a single device works, so nothing is measured
-    found = [fake("A", "a", gpu=True), fake("B", "b", index="1:0")]
-    measured(found[1:], 2.0)  # the first device fails in the measurement
-    assert first(found) == "1:0" and first(found) == "1:0" and counts == [1]
+    rows = [fake("A", "a"), fake("B", "b", index="1:0", problem="does not run: x")]
+    counts = measured(rows, 1.0, 2.0)
+    assert first(rows) == "0:0" and counts == []  # a single device works, so nothing is measured
+    rows = [fake("A", "a", gpu=True), fake("B", "b", index="1:0")]
+    measured(rows[1:], 2.0)  # the first device fails in the measurement
+    assert first(rows) == "1:0" and first(rows) == "1:0" and counts == [1]
 
 
 @pytest.mark.parametrize("content", ["", "[]", "1", '{"A, a, 1": "x"}', '{"A, a, 1": null}'])
 def test_a_damaged_file_is_measured_anew(measured, tmp_path, content):
-    found = [fake("A", "a"), fake("B", "b", index="1:0")]
-    counts = measured(found, 1.0, 2.0)
-    first(found)
+    rows = [fake("A", "a"), fake("B", "b", index="1:0")]
+    counts = measured(rows, 1.0, 2.0)
+    first(rows)
     (tmp_path / "cache" / speeds.SPEEDS).write_text(content)
-    assert first(found) == "1:0" and counts == [1, 2]
+    assert first(rows) == "1:0" and counts == [1, 2]
 
 
 def test_without_a_cache_nothing_is_measured(measured, tmp_path, monkeypatch):
     """Otherwise each command would choose anew."""
     (tmp_path / "file").touch()
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "file" / "cache"))
-    found = [fake(POCL, "a"), fake(INTEL, "b", index="1:0"), fake("B", "g", gpu=True, index="2:0")]
-    counts = measured(found, 3.0, 1.0, 2.0)
-    assert [one[0] for one in speeds.by_speed(found)] == ["2:0", "1:0", "0:0"] and counts == []
+    rows = [fake(POCL, "a"), fake(INTEL, "b", index="1:0"), fake("B", "g", gpu=True, index="2:0")]
+    counts = measured(rows, 3.0, 1.0, 2.0)
+    assert [row[0] for row in speeds.by_speed(rows)] == ["2:0", "1:0", "0:0"] and counts == []
 
 
 def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
-    found = [fake("A", "a"), fake("B", "b", index="1:0")]
-    measured(found, 1.0, 2.0)
-    monkeypatch.setattr(drivers, "list_devices", lambda **_: found)
+    rows = [fake("A", "a"), fake("B", "b", index="1:0")]
+    measured(rows, 1.0, 2.0)
+    monkeypatch.setattr(drivers, "list_devices", lambda **_: rows)
     monkeypatch.setattr("pp_cl.engine.device.quirks.describe", lambda d: dict.fromkeys(NAMES, 1))
     assert main(["devices", "--json"]) == 0
     assert [row["default"] for row in json.loads(capsys.readouterr().out)] == [False, True]

@@ -37,8 +37,8 @@ def test_packed_layout(rng):
 def test_places_in_the_image_and_rays_through_pixels(rng):
     camera = make_camera(rng)
     points = points_in_front(camera, rng)
-    *found, depth = camera.project(points)
-    np.testing.assert_allclose(np.transpose(found), project(camera, points))
+    *pixels, depth = camera.project(points)
+    np.testing.assert_allclose(np.transpose(pixels), project(camera, points))
     np.testing.assert_allclose(depth, (points - camera.eye) @ camera.pose[:, 2])
     x, y, depth = camera.project(camera.eye + 2.5 * camera.rays())
     np.testing.assert_allclose([x[3, 7], y[3, 7], depth[3, 7]], [7.5, 3.5, 2.5])

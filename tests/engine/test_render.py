@@ -91,13 +91,13 @@ def test_image_and_gradients(dev, rng, name, side, early_stop, blend):
 
 def test_all_samples_of_a_pixel_share_its_fragments(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
-    found = {}
+    fragments = {}
     for side in (1, 2):
         renderer = Renderer(dev, model, RasterConfig(radius=0.85), supersampling=side)
         result = renderer.forward(camera, GAMMA, training=True)
-        found[side] = result.fragments()
-        assert found[side].sum() == result.pairs.total
-    assert (found[2] >= found[1]).all() and found[2].sum() < 2.2 * found[1].sum()
+        fragments[side] = result.fragments()
+        assert fragments[side].sum() == result.pairs.total
+    assert (fragments[2] >= fragments[1]).all() and fragments[2].sum() < 2.2 * fragments[1].sum()
     rest = result.weights.sample_transmittance.get().mean(1)
     np.testing.assert_allclose(result.transmittance.get(), rest, atol=1e-6)
 
@@ -119,11 +119,11 @@ def test_a_margin_is_the_image_around_it_and_no_training_has_one(dev, rng):
     settings = RasterConfig(blend="alpha", radius=0.85)
     plain, framed = (Renderer(dev, model, settings, 2, margin) for margin in (0, 4))
     larger = plain.render(camera.crop(-4, -5, 28, 28), GAMMA)
-    found = framed.forward(camera, GAMMA)
-    image = found.clamped()
+    result = framed.forward(camera, GAMMA)
+    image = result.clamped()
     np.testing.assert_array_equal(image, larger[5:23, 4:24])
     assert (image != plain.render(camera, GAMMA)).any()
-    assert framed.forward(camera, GAMMA, training=True).size == (20, 20) != found.size
+    assert framed.forward(camera, GAMMA, training=True).size == (20, 20) != result.size
     assert framed.forward(camera, GAMMA, until="features").size == (20, 20)
 
 
@@ -145,8 +145,8 @@ def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
     back[:, 3] -= 2 * far * back[:, 2]
     away = replace(camera, pose=back)
     assert renderer.forward(away, GAMMA, until="weights").pairs.total == 0
-    seen = renderer.forward(away, GAMMA, until="weights", depth_range=(far, 4 * far))
-    assert seen.pairs.total > 0
+    result = renderer.forward(away, GAMMA, until="weights", depth_range=(far, 4 * far))
+    assert result.pairs.total > 0
 
 
 @pytest.mark.parametrize("blend", BLENDS)

@@ -51,8 +51,8 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
 def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
     run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
     shutil.copytree(finished, other)
-    given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
-    assert main([*arguments(scene, whole, **given), "--network", str(other)]) == 0
+    settings = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
+    assert main([*arguments(scene, whole, **settings), "--network", str(other)]) == 0
     _, expected = load_checkpoint(finished / "checkpoint.npz")
     _, arrays = load_checkpoint(whole / "checkpoint.npz")
     for name in (name for name in expected if name.startswith("net.")):
@@ -60,15 +60,15 @@ def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_
     losses = [[r["loss"] for r in rows(out)[:5]] for out in (whole, finished)]
     assert np.mean(losses[0]) < 0.9 * np.mean(losses[1])
 
-    train_and_interrupt(scene, run, 25, monkeypatch, **given, network__start=other)
+    train_and_interrupt(scene, run, 25, monkeypatch, **settings, network__start=other)
     shutil.rmtree(other)
     assert main(["train", "--out", str(run)]) == 0
     assert checkpoint(run) == checkpoint(whole)
 
     words = arguments(scene, tmp_path / "no", network__widths="16,16,32")
     assert "other/config.json: No such file" in failure(*words, "--network", other)
-    told = failure(*words, "--network", finished)
-    assert "has network.widths=16,16,16, this training 16,16,32" in told
+    error = failure(*words, "--network", finished)
+    assert "has network.widths=16,16,16, this training 16,16,32" in error
     assert not (tmp_path / "no").exists()
 
 

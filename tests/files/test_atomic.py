@@ -83,8 +83,8 @@ def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
     folder.mkdir()
     (folder / "index.html").write_text("half")
     remove_leftovers(tmp_path)
-    left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
-    assert left == set(staying) and not folder.exists()
+    files_left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert files_left == set(staying) and not folder.exists()
 
 
 def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch):

@@ -69,11 +69,11 @@ def colours(rng, dtype, alpha):
     """({channel: plane}, expected (H, W, 4) of 8 bits); light is HDR, with some pixels above 1."""
     light = rng.uniform(0, 1.4, (HEIGHT, WIDTH, 3)).astype(dtype)
     share = rng.uniform(0.2, 1, (HEIGHT, WIDTH)).astype(dtype) if alpha else None
-    given = light * share[..., None] if alpha else light
-    channels = {name: np.ascontiguousarray(given[..., i]) for i, name in enumerate("RGB")}
+    premultiplied = light * share[..., None] if alpha else light
+    channels = {name: np.ascontiguousarray(premultiplied[..., i]) for i, name in enumerate("RGB")}
     if alpha:
         channels["A"] = share
-    straight = given.astype(float) / (share[..., None].astype(float) if alpha else 1)
+    straight = premultiplied.astype(float) / (share[..., None].astype(float) if alpha else 1)
     opaque = np.full((HEIGHT, WIDTH), 255.0)
     return channels, np.dstack([srgb(straight), np.rint(255 * share) if alpha else opaque])
 
@@ -85,8 +85,8 @@ def test_every_kind_is_read(tmp_path, rng, dtype, alpha, tiled):
     channels, expected = colours(rng, dtype, alpha)
     stored(tmp_path / "a.exr", channels, tiled=tiled)
     assert image_size(tmp_path / "a.exr") == (WIDTH, HEIGHT)
-    found = read_rgba(tmp_path / "a.exr")
-    assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 1
+    rgba = read_rgba(tmp_path / "a.exr")
+    assert rgba.dtype == np.uint8 and np.abs(rgba - expected).max() <= 1
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (4, 3), (-4, 2), (20, 20), (-100, 0)])
@@ -98,12 +98,12 @@ def test_windows_that_differ(tmp_path, rng, shift):
     assert image_size(tmp_path / "a.exr") == (20, 12)
     canvas = np.zeros((140, 300, 4))
     canvas[40 + shift[1] :, 120 + shift[0] :][:HEIGHT, :WIDTH] = expected
-    found = read_rgba(tmp_path / "a.exr")
+    rgba = read_rgba(tmp_path / "a.exr")
     wanted = canvas[40:52, 120:140]
-    assert np.abs(found[..., 3] - wanted[..., 3]).max() <= 1
+    assert np.abs(rgba[..., 3] - wanted[..., 3]).max() <= 1
     there = wanted[..., 3] > 0
-    assert np.abs(found[there] - wanted[there]).max(initial=0) <= 1
-    assert not found[~there][:, 3].any()
+    assert np.abs(rgba[there] - wanted[there]).max(initial=0) <= 1
+    assert not rgba[~there][:, 3].any()
 
 
 def test_gray_and_one_layer(tmp_path, rng):
@@ -157,5 +157,5 @@ def test_it_may_be_an_image_of_a_scene(tmp_path):
     planes = {name: np.ascontiguousarray(light[..., i]) for i, name in enumerate("RGBA")}
     write_exr(file.with_suffix(".exr"), planes)
     file.unlink()
-    found = load_scene(tmp_path).splits["train"][0].image
-    assert np.abs(found.astype(int) - image * (image[..., 3:] > 0)).max() <= 1
+    converted = load_scene(tmp_path).splits["train"][0].image
+    assert np.abs(converted.astype(int) - image * (image[..., 3:] > 0)).max() <= 1

@@ -105,8 +105,8 @@ def test_colours_of_other_spaces_become_srgb(tmp_path):
     image = Image.new("RGB", (40, 30), (200, 90, 60))
     image.save(tmp_path / "p3.png", icc_profile=display_p3())
     with pytest.warns(UserWarning, match="a colour profile of their own are read as sRGB"):
-        found = read_rgba(tmp_path / "p3.png")[..., :3]
-    assert np.abs(found - in_srgb((200, 90, 60))).max() <= 1
+        rgb = read_rgba(tmp_path / "p3.png")[..., :3]
+    assert np.abs(rgb - in_srgb((200, 90, 60))).max() <= 1
     image.save(tmp_path / "srgb.jpg", icc_profile=own, quality=95, subsampling=0)
     assert np.abs(read_rgba(tmp_path / "srgb.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 2
     image.convert("CMYK").save(tmp_path / "inks.jpg", quality=95)

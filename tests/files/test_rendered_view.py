@@ -34,12 +34,12 @@ def test_straight_colours_come_back(rng):
     shown, straight = view_and_colours(rng)
     rgba, channels = shown.rgba(), shown.channels()
     np.testing.assert_array_equal(rgba[..., 3], shown.alpha)
-    seen = shown.alpha > 0.05
-    np.testing.assert_allclose(rgba[seen][:, :3], straight[seen], atol=1e-5)
+    visible = shown.alpha > 0.05
+    np.testing.assert_allclose(rgba[visible][:, :3], straight[visible], atol=1e-5)
     assert np.isfinite(rgba).all()
     light = srgb_to_linear(straight) * shown.alpha[..., None]  # as OpenEXR keeps it
     linear = np.dstack([channels[name] for name in "RGB"])
-    np.testing.assert_allclose(linear[seen], light[seen], atol=1e-5)
+    np.testing.assert_allclose(linear[visible], light[visible], atol=1e-5)
 
 
 def test_transfer_functions_are_inverse():

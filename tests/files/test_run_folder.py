@@ -73,8 +73,8 @@ def test_a_damaged_log_is_cut_off_there(folder, line):
         log = folder.open_log(20)
     with log:
         assert log.seconds == 0.5 and rows(folder) == ROWS[:1]
-    (told,) = (str(warning.message) for warning in warned)
-    assert told.startswith(f"{folder.log}: ") and told.isprintable()
+    (message,) = (str(warning.message) for warning in warned)
+    assert message.startswith(f"{folder.log}: ") and message.isprintable()
 
 
 @pytest.mark.unix

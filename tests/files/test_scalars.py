@@ -12,9 +12,9 @@ from pp_cl.files.scalars import scalars
 def test_a_row_gives_a_curve_for_every_number():
     row = {"step": 5, "seconds": 1.2, "device": "x", "psnr": 30.5, "finished": True}
     row |= {"points": 7, "rates": {"sh": (0.5, 0.1), "network": 1e-3}}
-    found = dict(scalars(row))
-    assert found.pop("finished") is True
-    assert found == {
+    curves = dict(scalars(row))
+    assert curves.pop("finished") is True
+    assert curves == {
         "psnr": 30.5,
         "points": 7,
         "rates/sh/0": 0.5,
@@ -35,11 +35,11 @@ def test_a_training_writes_the_numbers_of_its_log(tmp_path):
     pytest.importorskip("tensorboardX")
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
     assert main([*arguments(scene, out, train__iterations=20), "--tensorboard"]) == 0
-    found = read_events(next((out / "tensorboard").iterdir()).read_bytes())
+    curves = read_events(next((out / "tensorboard").iterdir()).read_bytes())
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()[:-1]]
     for name in ("loss", "psnr", "ssim", "points"):
-        assert found[name] == [(row["step"], pytest.approx(row[name])) for row in log]
-    assert found["rates/sh/2"] == [
+        assert curves[name] == [(row["step"], pytest.approx(row[name])) for row in log]
+    assert curves["rates/sh/2"] == [
         (row["step"], pytest.approx(row["rates"]["sh"][2])) for row in log
     ]
 
@@ -50,11 +50,11 @@ def read_events(data):
     """
     from tensorboardX.proto.event_pb2 import Event
 
-    found, place = {}, 0
+    curves, place = {}, 0
     while place < len(data):
         length = int.from_bytes(data[place : place + 8], "little")
         event = Event.FromString(data[place + 12 : place + 12 + length])
         for value in event.summary.value:
-            found.setdefault(value.tag, []).append((event.step, value.simple_value))
+            curves.setdefault(value.tag, []).append((event.step, value.simple_value))
         place += 12 + length + 4
-    return found
+    return curves

@@ -61,7 +61,7 @@ def test_windows_is_told_not_to_translate_line_ends(tmp_path, monkeypatch):
     (tmp_path / "file").write_bytes(b"a\r\n\x1a")
     flags, real = [], os.open
     monkeypatch.setattr(os, "O_BINARY", 1 << 15, raising=False)
-    monkeypatch.setattr(os, "open", lambda path, *given: flags.extend(given) or real(path, 0))
+    monkeypatch.setattr(os, "open", lambda path, *args: flags.extend(args) or real(path, 0))
     assert read_regular(tmp_path / "file", 9) == "a\r\n\x1a"
     assert flags[0] & os.O_BINARY
 
@@ -75,9 +75,9 @@ def test_the_mend_fits_the_reason():
         "a.png: cannot be read as PNG (image file is truncated); copy it again"
     )
     broken = BadZipFile("two\nlines " + "x" * 500)
-    said = str(refusal("a.npz", broken, "arrays", "write it again"))
-    assert said.startswith("a.npz: cannot be read as arrays (two lines xxx")
-    assert said.endswith("...); write it again") and len(said) < MOST_REASON + 60
+    message = str(refusal("a.npz", broken, "arrays", "write it again"))
+    assert message.startswith("a.npz: cannot be read as arrays (two lines xxx")
+    assert message.endswith("...); write it again") and len(message) < MOST_REASON + 60
     assert "(EOFError)" in str(refusal("a", EOFError(), "JSON"))
     beyond = OSError(errno.EOVERFLOW, "Value too large for defined data type")
     assert str(refusal("a.bin", beyond, "COLMAP's")).endswith("copy it again")

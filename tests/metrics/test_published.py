@@ -55,8 +55,8 @@ def test_co3d_is_known_by_the_sequence():
 
 def test_what_differs_is_said():
     assert differences("lego", cameras(count=200), 1) == ""
-    told = "published: 200 test views of 800x800 pixels; here: "
-    assert differences("lego", cameras(count=25), 4) == f"{told}25 test views of 200x200 pixels"
-    assert differences("lego", cameras(count=200), 1, "train").startswith(f"{told}200 train")
+    start = "published: 200 test views of 800x800 pixels; here: "
+    assert differences("lego", cameras(count=25), 4) == f"{start}25 test views of 200x200 pixels"
+    assert differences("lego", cameras(count=200), 1, "train").startswith(f"{start}200 train")
     assert differences("34_1479_4753", cameras(), 1, "train") == "here: split train"
     assert differences("34_1479_4753", cameras(), 2) == "here: images reduced 2 times"

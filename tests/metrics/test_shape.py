@@ -22,12 +22,12 @@ SQUARE = Mesh(
 
 
 def test_launches_add_up(dev, monkeypatch):
-    told = []
-    one = sample_surface(dev, SQUARE, Grid((0.0, 0, 0), 0.03, (2, 2, 2)), 5000)
+    advances = []
+    surface = sample_surface(dev, SQUARE, Grid((0.0, 0, 0), 0.03, (2, 2, 2)), 5000)
     monkeypatch.setattr("pp_cl.metrics.shape.LAUNCH", 3 * RUN)
-    many = sample_surface(dev, SQUARE, one.grid, 5000, advance=told.append)
-    np.testing.assert_array_equal(one.bits, many.bits)
-    assert sum(told) == 5000 and len(told) == 7
+    many = sample_surface(dev, SQUARE, surface.grid, 5000, advance=advances.append)
+    np.testing.assert_array_equal(surface.bits, many.bits)
+    assert sum(advances) == 5000 and len(advances) == 7
 
 
 def test_the_grid_grows_around_the_mesh_in_step(dev):
@@ -42,8 +42,8 @@ def test_overlap_by_hand():
     grid = Grid((0.0, 0, 0), 1.0, (3, 2, 1))
     ids = grid.ids(np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (2, 1, 0)]))
     surface = Surface(grid, np.array([[0b010], [0b011]], np.uint32), 3)
-    found = overlap(surface, grid, ids)
-    assert found == {"points": 4, "iou": 2 / 5, "recall": 2 / 3, "precision": 2 / 4}
+    scores = overlap(surface, grid, ids)
+    assert scores == {"points": 4, "iou": 2 / 5, "recall": 2 / 3, "precision": 2 / 4}
     larger = Surface(
         Grid((-1.0, -1, 0), 1.0, (4, 3, 1)), np.array([[0], [0b100], [0b110]], np.uint32), 3
     )

@@ -38,8 +38,8 @@ def test_a_shifted_mask_is_named(dev, count, bad):
     views = ball_views(count)
     views[bad] = shifted(views[bad], 0.15)
     hull = build_grid(dev, views, 2000)
-    [found] = disagreements(views, hull.grid.box)
-    assert found.view is views[bad] and found.share > 0.15
+    [disagreement] = disagreements(views, hull.grid.box)
+    assert disagreement.view is views[bad] and disagreement.share > 0.15
 
 
 def bitten(view, share):
@@ -80,8 +80,8 @@ def test_a_hull_forgives_masks_that_lack_a_part(dev):
 
 def directions(count):
     rng = np.random.default_rng(0)
-    found = rng.normal(size=(count, 3))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def far_from(hull, places):
@@ -125,8 +125,8 @@ def test_a_mask_that_lacks_a_part_is_named(dev):
     views[3] = bitten(views[3], 0.25)
     agreement = agreeing(dev, views)
     hull = build_grid(dev, agreement.views, 20_000, None, agreement.forgiven)
-    [found] = contradicting(views, hull, agreement)
-    assert found.view is views[3] and not agreement.left_out
+    [disagreement] = contradicting(views, hull, agreement)
+    assert disagreement.view is views[3] and not agreement.left_out
 
 
 @pytest.fixture
@@ -141,8 +141,8 @@ def scene(tmp_path):
 
 def test_the_scenes_facts_name_it_and_the_image_shows_it_first(dev, scene, tmp_path, capsys):
     facts, *shown = describe_scene(dev, scene, "tiny")
-    [told] = facts["masks"]["disagreeing"]
-    assert told["view"] == "train/r_4.png" and told["share"] > 0.15
+    [row] = facts["masks"]["disagreeing"]
+    assert row["view"] == "train/r_4.png" and row["share"] > 0.15
     sheet, plain = outline_sheet(dev, *shown), outline_sheet(dev, *shown[:2])
     first = sheet[14 : 14 + 48, :48].astype(int)
     tinted = (first[..., 0] >= REJECTED[0]) & (first[..., 2] <= 127) & (first[..., 1] >= 60)

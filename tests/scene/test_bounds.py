@@ -59,8 +59,8 @@ def test_boxes_move_and_grow_with_the_cameras():
     box = bounding_box(ball_views()) - CENTRE
     for place, scale in ((CENTRE, 1e-8), (CENTRE, 1e12), (np.array([1e6, -2e6, 3.0]), 1.0)):
         rounding = 1e-9 * scale + 1e-15 * np.abs(place).max()
-        found = bounding_box(placed(place, scale)) - place
-        np.testing.assert_allclose(found, scale * box, rtol=0, atol=10 * rounding)
+        moved = bounding_box(placed(place, scale)) - place
+        np.testing.assert_allclose(moved, scale * box, rtol=0, atol=10 * rounding)
 
 
 ALIKE = r"^train/r_0\.png and the 11 other training views: .* all in one place, \("

@@ -23,7 +23,7 @@ def folder(scene, tmp_path):
 
 def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, tmp_path, capsys):
     write_edits(folder, Edits(np.array(BOX), frozenset({"train/r_2.png", "test/r_0.png"})))
-    assert [one.name for one in scene_frames(folder, "test")] == ["test/r_1.png"]
+    assert [view.name for view in scene_frames(folder, "test")] == ["test/r_1.png"]
     assert main(arguments(str(folder), tmp_path / "run", train__iterations=2)) == 0
     header, _ = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     names = [name for name, _ in header["views"]]
@@ -34,11 +34,11 @@ def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, t
     assert (low >= np.array(BOX[0]) - 1e-6).all() and (high <= np.array(BOX[1]) + 1e-6).all()
     capsys.readouterr()
     assert main(["info", str(folder), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["box"] == BOX and found["splits"] == {"train": 7, "test": 1}
-    assert found["dropped"] == ["test/r_0.png", "train/r_2.png"]
-    given = configure(preset("tiny"), folder, [("scene.box", "-2,-2,-2,2,2,2", "--set")])
-    assert scene_box(given)[1, 2] == 2, "a setting goes before"
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["box"] == BOX and facts["splits"] == {"train": 7, "test": 1}
+    assert facts["dropped"] == ["test/r_0.png", "train/r_2.png"]
+    config = configure(preset("tiny"), folder, [("scene.box", "-2,-2,-2,2,2,2", "--set")])
+    assert scene_box(config)[1, 2] == 2, "a setting goes before"
 
 
 def test_a_run_knows_its_scene_after_views_were_dropped(folder, tmp_path, capsys, monkeypatch):

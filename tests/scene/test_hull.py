@@ -47,14 +47,14 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
 
 
 def test_what_two_of_many_images_see_is_dropped(dev):
-    here, there, one = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
+    here, there, vertex = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
     ahead = [(place, place + 4 * axis) for place in (here, there) for axis in np.eye(3)][1:]
     image = np.full((64, 64, 4), 255, np.uint8)
     image[0, 0] = 0  # without it there is no mask
     views = [View("full", ball_camera(eye, place), image) for place, eye in ahead]
     carver = Carver(dev, views)
-    assert not carver.carve(one).any()
-    assert carver.carve(one.moved(there)).all()
+    assert not carver.carve(vertex).any()
+    assert carver.carve(vertex.moved(there)).all()
 
 
 @pytest.mark.exact
@@ -84,18 +84,18 @@ def carvings(monkeypatch):
 @pytest.mark.large
 @pytest.mark.parametrize("points", (1000, 3000, 40000))
 def test_the_voxel_size_is_found(dev, points, carvings):
-    found = build_grid(dev, ball_views(), points)
-    assert points <= len(found.ids) <= hull.TOLERANCE * points and not found.capped
-    assert carvings[-1][1] == len(found.ids) and len(carvings) <= 1 + hull.ROUNDS
-    assert found.ids.dtype == np.uint32 and (np.diff(found.ids.astype(np.int64)) > 0).all()
-    ids = found.grid.ids_of(np.ones(found.grid.dims[::-1], bool))
-    lattice, in_hull = found.grid.positions(ids), np.isin(ids, found.ids)
+    built = build_grid(dev, ball_views(), points)
+    assert points <= len(built.ids) <= hull.TOLERANCE * points and not built.capped
+    assert carvings[-1][1] == len(built.ids) and len(carvings) <= 1 + hull.ROUNDS
+    assert built.ids.dtype == np.uint32 and (np.diff(built.ids.astype(np.int64)) > 0).all()
+    ids = built.grid.ids_of(np.ones(built.grid.dims[::-1], bool))
+    lattice, in_hull = built.grid.positions(ids), np.isin(ids, built.ids)
     from_centre = np.linalg.norm(lattice - CENTRE, axis=1)
     assert in_hull[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
     pixel = 4 / 96
     assert from_centre[in_hull].max() < 1.6 * RADIUS + 2 * pixel  # the hull is 12 tangent cones
     for axis in range(3):  # the grid is tight
-        reached = positions_of(found)[:, axis]
+        reached = positions_of(built)[:, axis]
         np.testing.assert_allclose(
             [reached.min(), reached.max()], [lattice[:, axis].min(), lattice[:, axis].max()]
         )
@@ -107,8 +107,8 @@ def test_the_cell_cap_limits_the_grid(dev, carvings, monkeypatch):
     points.
     """
     monkeypatch.setattr(hull, "CELL_CAP", 8000)
-    found = build_grid(dev, ball_views(), 7000)
-    assert found.capped and 3000 < len(found.ids) < 7000
+    built = build_grid(dev, ball_views(), 7000)
+    assert built.capped and 3000 < len(built.ids) < 7000
     assert all(np.prod(grid.dims) <= 8000 for grid, _ in carvings[1:])
 
 
@@ -139,11 +139,11 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
         view.image[0, 0] = 0
     box = bounding_box(views)
     assert np.isfinite(box).all() and (box[1] > box[0]).all()
-    found = positions_of(build_grid(dev, views, 3000))
+    positions = positions_of(build_grid(dev, views, 3000))
     shown = CENTRE + 0.5 * min(RADIUS, 4 / (2 * focal)) * np.random.default_rng(1).uniform(
         -1, 1, (100, 3)
     )
-    nearest = np.linalg.norm(found[None] - shown[:, None], axis=-1).min(1)
+    nearest = np.linalg.norm(positions[None] - shown[:, None], axis=-1).min(1)
     assert nearest.max() < 0.2 * RADIUS
 
 
@@ -178,11 +178,11 @@ def test_close_ups_bound_the_object_only_where_no_image_shows_it_whole(dev, whol
 @pytest.mark.parametrize("stated", [None, (1.0, 9.0), (3.9, 4.1)])
 def test_depth_range_holds_every_point(dev, stated):
     views = [replace(view, depth_range=stated) for view in ball_views()]
-    found = build_grid(dev, views, 2000)
-    distances = [np.linalg.norm(positions_of(found) - v.camera.eye, axis=1) for v in views]
-    near, far = depth_range(views, found)
+    built = build_grid(dev, views, 2000)
+    distances = [np.linalg.norm(positions_of(built) - v.camera.eye, axis=1) for v in views]
+    near, far = depth_range(views, built)
     assert 0 < near < np.min(distances) and far > np.max(distances)
-    half_diagonal = found.grid.voxel_size * np.linalg.norm(found.grid.dims) / 2
+    half_diagonal = built.grid.voxel_size * np.linalg.norm(built.grid.dims) / 2
     if stated is None:
         assert far - near == pytest.approx(2 * hull.DEPTH_MARGIN * half_diagonal, rel=0.05)
     if stated == (1.0, 9.0):
@@ -193,20 +193,20 @@ def test_depth_range_holds_every_point(dev, stated):
 @pytest.mark.parametrize("distance", (1.6, 0.5))
 def test_depth_range_of_close_cameras(dev, distance):
     """1.6 is outside the hull's box, but inside the enlarged ball; 0.5 is inside the box."""
-    found = build_grid(dev, ball_views(), 2000)
+    built = build_grid(dev, ball_views(), 2000)
     camera = ball_camera(CENTRE + np.array([distance, 0, 0]), CENTRE)
-    near, far = depth_range([replace(ball_views()[0], stored_camera=camera)], found)
-    distances = np.linalg.norm(positions_of(found) - camera.eye, axis=1)
+    near, far = depth_range([replace(ball_views()[0], stored_camera=camera)], built)
+    distances = np.linalg.norm(positions_of(built) - camera.eye, axis=1)
     assert near > 0 and far > distances.max()
-    assert near < distances.min() if distance > 1 else near == found.grid.voxel_size
+    assert near < distances.min() if distance > 1 else near == built.grid.voxel_size
 
 
 @pytest.mark.large
 def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
     box = np.stack([CENTRE, CENTRE + [3, 0.4, 3]])
-    found = build_grid(dev, ball_views(), 2000, box)
-    assert (found.grid.box[0] > box[0] - 2 * found.grid.voxel_size).all()
-    assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.voxel_size, 1.6]).all()
+    built = build_grid(dev, ball_views(), 2000, box)
+    assert (built.grid.box[0] > box[0] - 2 * built.grid.voxel_size).all()
+    assert (built.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * built.grid.voxel_size, 1.6]).all()
 
 
 @pytest.mark.large
@@ -227,8 +227,8 @@ def test_lego_has_the_published_shape(dev, data):
     194x345x232 vertices.
     """
     views = load_scene(data / "nerf_synthetic/lego").splits["train"]
-    found = build_grid(dev, views, 20000)
-    assert 20000 <= len(found.ids) <= hull.TOLERANCE * 20000
-    edges = np.array(found.grid.dims) / (np.array([194, 345, 232]) * (20000 / 4e6) ** (1 / 3))
+    built = build_grid(dev, views, 20000)
+    assert 20000 <= len(built.ids) <= hull.TOLERANCE * 20000
+    edges = np.array(built.grid.dims) / (np.array([194, 345, 232]) * (20000 / 4e6) ** (1 / 3))
     assert np.abs(edges - 1).max() < 0.06
-    assert depth_range(views, found) == pytest.approx((2, 6), abs=0.15)
+    assert depth_range(views, built) == pytest.approx((2, 6), abs=0.15)

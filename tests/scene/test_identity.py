@@ -54,14 +54,14 @@ def test_cameras_that_another_processor_rounds_otherwise_are_the_same(folder, fa
 
 
 def test_names_cameras_and_depth_ranges_come_back_to_the_bit(folder):
-    listed = [replace(one, depth_range=None) for one in scene_frames(str(folder))]
+    listed = [replace(image_file, depth_range=None) for image_file in scene_frames(str(folder))]
     views = [replace(view, depth_range=None) for view in views_of(folder)]
     views[1] = replace(views[1], depth_range=(0.1, 7.3))
     listed[1] = replace(listed[1], depth_range=(0.1, 7.3))
     packed = unpacked_views(json.loads(json.dumps(identity(views)["views"])))
-    for one, image_file in zip(packed, listed, strict=True):
-        assert np.array_equal(one.camera.pose, image_file.camera.pose)
-        lens = [replace(p, camera=replace(p.camera, pose=None)) for p in (one, image_file)]
+    for view, image_file in zip(packed, listed, strict=True):
+        assert np.array_equal(view.camera.pose, image_file.camera.pose)
+        lens = [replace(p, camera=replace(p.camera, pose=None)) for p in (view, image_file)]
         assert lens[0] == lens[1]
 
 
@@ -80,10 +80,10 @@ def test_other_pixels_are_named(folder, channel):
 
 
 def test_other_cameras_and_names_are_told_and_more_views_are_none(folder):
-    listed, told = scene_frames(folder), "its training views have other names or cameras"
+    listed, reason = scene_frames(folder), "its training views have other names or cameras"
     header = identity(views_of(folder))
-    assert difference(header, listed[1:]) == told
-    assert difference(header, [replace(listed[0], name="train/x.png"), *listed[1:]]) == told
+    assert difference(header, listed[1:]) == reason
+    assert difference(header, [replace(listed[0], name="train/x.png"), *listed[1:]]) == reason
     assert difference(header, [replace(listed[0], name="train/x.png"), *listed]) == ""
     move_scene(folder, (0, 0, 1e-3))
-    assert difference(header, scene_frames(folder)) == told
+    assert difference(header, scene_frames(folder)) == reason

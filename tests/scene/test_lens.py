@@ -56,11 +56,11 @@ def test_opencv_undistorts_alike(dev, name):
     matrix = np.array([[CAMERA.fx, 0, CAMERA.cx - 0.5], [0, CAMERA.fy, CAMERA.cy - 0.5], [0, 0, 1]])
     radial, end = (lens.k1, lens.k2), (matrix, (CAMERA.width, CAMERA.height), cv2.CV_32FC1)
     if lens.fisheye:
-        given = np.array([*radial, lens.k3, lens.k4])
-        maps = cv2.fisheye.initUndistortRectifyMap(matrix, given, np.eye(3), *end)
+        coefficients = np.array([*radial, lens.k3, lens.k4])
+        maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), *end)
     else:
-        given = np.array([*radial, lens.p1, lens.p2, lens.k3])
-        maps = cv2.initUndistortRectifyMap(matrix, given, None, *end)
+        coefficients = np.array([*radial, lens.p1, lens.p2, lens.k3])
+        maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, *end)
     expected = cv2.remap(value, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(int)
     assert np.abs(expected - value).max() > 10, "a lens that moves nothing tests nothing"
     opaque, white = np.full_like(value, 255), np.full_like(value, 200)
@@ -68,8 +68,8 @@ def test_opencv_undistorts_alike(dev, name):
         (np.dstack([value, value, value, opaque]), 0),
         (np.dstack([white, white, white, value]), 3),
     ):
-        found = undistort(dev, image, CAMERA, lens)[..., channel]
-        assert np.abs(found - expected).max() <= 2
+        undistorted = undistort(dev, image, CAMERA, lens)[..., channel]
+        assert np.abs(undistorted - expected).max() <= 2
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -78,8 +78,8 @@ def test_one_colour_stays_one_colour(dev, name):
     image = np.full((120, 161, 4), (200, 30, 90, 255), np.uint8)
     assert np.array_equal(undistort(dev, image, CAMERA, LENSES[name]), image)
     image[:, :80] = (0, 255, 0, 0)
-    found = undistort(dev, image, CAMERA, LENSES[name])
-    shown = found[found[..., 3] > 30][:, :3].astype(int)
+    undistorted = undistort(dev, image, CAMERA, LENSES[name])
+    shown = undistorted[undistorted[..., 3] > 30][:, :3].astype(int)
     assert np.abs(shown - [200, 30, 90]).max() <= 4
 
 
@@ -114,8 +114,8 @@ def test_reducing_a_warp_as_it_is_read_is_reducing_the_warped_image(dev, data, f
     image = read_rgba(data / "ethiopian_head_photos/DSC_0033.jpg")
     camera = Camera(np.eye(3, 4), 1200.0, 1200.0, 503.0, 495.0, 1000, 1000)
     whole = undistort(dev, image, camera, LENSES["barrel"])
-    found = undistort(dev, image, camera, LENSES["barrel"], factor)
+    undistorted = undistort(dev, image, camera, LENSES["barrel"], factor)
     reduced = shrink(whole, factor)
-    assert (np.abs(found.astype(int) - reduced) <= 1).all(2).mean() >= 0.999
+    assert (np.abs(undistorted.astype(int) - reduced) <= 1).all(2).mean() >= 0.999
     first = undistort(dev, shrink(image, factor), camera.downscaled(factor), LENSES["barrel"])
     assert (np.abs(first.astype(int) - reduced) <= 1).all(2).mean() < 0.9

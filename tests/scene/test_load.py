@@ -80,9 +80,9 @@ def test_as_many_images_are_read_at_once_as_memory_holds(
     monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
     camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
     phone = ImageFile("a.jpg", camera, lens=lens)
-    told = reading_cost([phone] * 300, SceneConfig(mask_from=source), factor)
+    cost = reading_cost([phone] * 300, SceneConfig(mask_from=source), factor)
     bands = BAND_COPIES * BAND_BYTES if lens else 0
-    assert told == (workers, workers * per_pixel * 12_000_000 + bands)
+    assert cost == (workers, workers * per_pixel * 12_000_000 + bands)
     small = ImageFile("b.jpg", camera.downscaled(10))
     assert reading_cost([small] * 300)[0] == 64 and reading_cost([small] * 5)[0] == 5
 
@@ -115,7 +115,7 @@ def test_pictures_that_are_there_twice(tmp_path, listed):
         data["test_filenames"] = ["images/03_b.png", "images/05_b.png"]
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     splits = [
-        {one.name.partition("_")[0] for one in list_split(tmp_path, split).image_files}
+        {file.name.partition("_")[0] for file in list_split(tmp_path, split).image_files}
         for split in ("train", "test")
     ]
     if listed:

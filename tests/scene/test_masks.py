@@ -45,21 +45,21 @@ def test_a_uniform_background_is_cut_out(rng, background):
     image = over(alpha, (0.7, 0.2, 0.25), background).astype(float)
     image[..., :3] += rng.normal(0, 2, image[..., :3].shape) + np.linspace(-3, 3, 60)[:, None]
     image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    found = cut_out(image, "a.png", TOLERANCE)
-    assert ((found[..., 3] > 127) == (alpha > 0.5)).all()
-    assert (found[..., 3][alpha == 1] > 220).all(), "the noise of the colours is that of the edge"
+    rgba = cut_out(image, "a.png", TOLERANCE)
+    assert ((rgba[..., 3] > 127) == (alpha > 0.5)).all()
+    assert (rgba[..., 3][alpha == 1] > 220).all(), "the noise of the colours is that of the edge"
     inside = disc(radius=17) == 1
-    assert np.abs(found[inside].astype(int) - image[inside]).max() <= 1
+    assert np.abs(rgba[inside].astype(int) - image[inside]).max() <= 1
 
 
 def test_soft_edges_lose_the_background(rng):
     """A half transparent pixel gets the object's colour, not a mixture with the screen."""
     alpha, colour = disc(soft=1.2), np.array([0.8, 0.3, 0.2])
-    found = cut_out(over(alpha, colour, (0.0, 1.0, 0.0)), "a.png", TOLERANCE) / 255
-    edge = (found[..., 3] > 0.3) & (found[..., 3] < 1)
+    rgba = cut_out(over(alpha, colour, (0.0, 1.0, 0.0)), "a.png", TOLERANCE) / 255
+    edge = (rgba[..., 3] > 0.3) & (rgba[..., 3] < 1)
     assert edge.sum() > 10
     mixed = (alpha[..., None] * colour + (1 - alpha[..., None]) * [0, 1, 0])[edge]
-    error, before = (np.abs(c - colour).mean() for c in (found[edge][:, :3], mixed))
+    error, before = (np.abs(c - colour).mean() for c in (rgba[edge][:, :3], mixed))
     assert error < 0.7 * before
 
 
@@ -86,8 +86,8 @@ def test_an_object_at_the_border_does_not_decide():
     """The object covers less than half of the border, so the other colour is the background."""
     image = over(np.zeros((40, 40)), (0, 0, 0), (1, 1, 1))
     image[:25, :30, :3] = (200, 30, 30)
-    found = cut_out(image, "a.png", TOLERANCE)[..., 3]
-    assert (found[:25, :30] == 255).all() and (found[25:] == 0).all()
+    alpha = cut_out(image, "a.png", TOLERANCE)[..., 3]
+    assert (alpha[:25, :30] == 255).all() and (alpha[25:] == 0).all()
 
 
 @pytest.mark.parametrize("named", ["{stem}.png", "{name}.png", "{stem}.jpg"])
@@ -147,11 +147,11 @@ def test_a_ball_on_white_has_the_hull_of_its_masks(dev, tmp_path):
     opaque_ball(tmp_path / "white")
     write_ball_scene(tmp_path / "masked", views=10, size=40)
     cut = load_scene(tmp_path / "white", masks=SceneConfig(mask_from="color")).splits["train"]
-    given = load_scene(tmp_path / "masked").splits["train"]
-    for a, b in zip(cut, given, strict=True):
+    masked = load_scene(tmp_path / "masked").splits["train"]
+    for a, b in zip(cut, masked, strict=True):
         masks = [view.image[..., 3] > MASK_THRESHOLD for view in (a, b)]
         assert (masks[0] != masks[1]).mean() < 0.01
-    hulls = [build_grid(dev, views, 2000) for views in (cut, given)]
+    hulls = [build_grid(dev, views, 2000) for views in (cut, masked)]
     assert hulls[0].grid.voxel_size == pytest.approx(hulls[1].grid.voxel_size, rel=0.02)
 
 
@@ -209,8 +209,10 @@ def test_masks_that_are_half_transparent_are_told(dev, tmp_path, sigma, recwarn)
         rgba[..., 3] = gaussian_filter(rgba[..., 3], sigma or 0.5)
         write_png(file, rgba)
     open_scene(dev, configure(preset("tiny"), scene), ("train",))
-    told = [str(one.message) for one in recwarn if "half transparent" in str(one.message)]
-    assert len(told) == bool(sigma)
+    messages = [
+        str(warning.message) for warning in recwarn if "half transparent" in str(warning.message)
+    ]
+    assert len(messages) == bool(sigma)
 
 
 def test_inverted_masks_are_told(dev, tmp_path):

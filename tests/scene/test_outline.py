@@ -22,10 +22,10 @@ def ball_points(per_radius, shell=False):
 def test_the_silhouette_is_that_of_the_ball_without_gaps(per_radius, shell):
     grid, ids = ball_points(per_radius, shell)
     camera = ball_camera(CENTRE + np.array([3.0, 2.0, 1.0]), CENTRE, size=(96, 80))
-    found = silhouette(grid, ids, camera)
+    mask = silhouette(grid, ids, camera)
     truth = ball_view("ball", camera).image[..., 3] > 0
-    assert found.shape == (80, 96)
-    wrong = found != truth
+    assert mask.shape == (80, 96)
+    wrong = mask != truth
     assert wrong.sum() < 0.12 * truth.sum()
     y, x = np.nonzero(wrong)  # pixels are wrong only along the border, within the points' spacing
     radius = np.sqrt(truth.sum() / np.pi)

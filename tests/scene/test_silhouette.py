@@ -30,9 +30,9 @@ def test_what_is_not_ignored_is_right(dev, views):
     bare = [opaque(view) for view in views[::3]]
     masked = [view for i, view in enumerate(views) if i % 3]
     for view, true in zip(within_silhouettes(dev, masked, bare), views[::3], strict=True):
-        said = ~view.ignored
-        assert np.array_equal(view.image[said, 3], true.image[said, 3])
-        shown = said & (true.image[..., 3] == 255)
+        known = ~view.ignored
+        assert np.array_equal(view.image[known, 3], true.image[known, 3])
+        shown = known & (true.image[..., 3] == 255)
         assert np.array_equal(view.image[shown], true.image[shown])
         assert view.ignored.mean() < 0.12 and shown.mean() > 0.7 * (true.image[..., 3] > 0).mean()
         assert not view.image[view.ignored].any()
@@ -46,10 +46,10 @@ def test_views_whose_masks_are_gone_are_used(dev, views, tmp_path, form):
         file.unlink()
     with pytest.warns(
         UserWarning, match=r"train: views without a mask .* \(images/000002\.png"
-    ) as told:
-        left = load_scene(tmp_path, dev=dev).splits["train"]
-    assert len(told) == 1 and [view.name for view in left] == [view.name for view in whole]
-    gone = [view for view in left if view.ignored is not None]
+    ) as warned:
+        used = load_scene(tmp_path, dev=dev).splits["train"]
+    assert len(warned) == 1 and [view.name for view in used] == [view.name for view in whole]
+    gone = [view for view in used if view.ignored is not None]
     assert (
-        len(gone) == len(left) - sum(view.is_masked and view.ignored is None for view in left) > 1
+        len(gone) == len(used) - sum(view.is_masked and view.ignored is None for view in used) > 1
     )

@@ -202,13 +202,13 @@ def test_wrong_masks_of_some_are_no_wrong_cameras(dev, tmp_path, count):
 
 
 def test_pictures_are_turned_where_their_masks_fit_only_so(dev, tmp_path):
-    folder = written(tmp_path / "scene", "colmap", lambda views: [backed(one) for one in views])
+    folder = written(tmp_path / "scene", "colmap", lambda views: [backed(view) for view in views])
     before = open_views(dev, folder)
     lying(folder / "images")
     with pytest.warns(UserWarning, match="turned as their EXIF says, as only then their masks fit"):
         after = open_views(dev, folder)
-    for one, other in zip(before, after, strict=True):
-        assert np.array_equal(one.image, other.image)
+    for view, turned in zip(before, after, strict=True):
+        assert np.array_equal(view.image, turned.image)
 
 
 def backed(view):

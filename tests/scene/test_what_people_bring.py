@@ -290,23 +290,23 @@ def train(folder, out):
 
 @pytest.mark.parametrize("report", TRAINS)
 def test_it_trains_and_says_what_was_done(tmp_path, report):
-    form, change, told = TRAINS[report]
+    form, change, message = TRAINS[report]
     change(a_ball(tmp_path / "scene", form))
     status, lines = train(tmp_path / "scene", tmp_path / "run")
-    said = [line for line in lines if line.startswith("pp-cl: ")]
+    messages = [line for line in lines if line.startswith("pp-cl: ")]
     assert status == 0, lines
-    assert len(said) == bool(told) and told in "".join(said), said
+    assert len(messages) == bool(message) and message in "".join(messages), messages
     header, _ = load_checkpoint(tmp_path / "run/checkpoint.npz")
-    assert len(header.get("notes", [])) == ("train: " in "".join(said))
-    assert len(header["views"]) == VIEWS - 2 - sum("views left out" in line for line in said) * (
-        2 if "2 of" in "".join(said) else 1
-    )
+    assert len(header.get("notes", [])) == ("train: " in "".join(messages))
+    assert len(header["views"]) == VIEWS - 2 - sum(
+        "views left out" in line for line in messages
+    ) * (2 if "2 of" in "".join(messages) else 1)
 
 
 def test_a_test_split_of_which_no_image_has_a_mask_is_listed(tmp_path):
     folder = a_ball(tmp_path / "scene", "colmap")
     gone("masks/000000.png.png", "masks/000008.png.png")(folder)
-    assert [one.mask for one in list_split(folder, "test").image_files] == [None, None]
+    assert [file.mask for file in list_split(folder, "test").image_files] == [None, None]
 
 
 def test_a_test_view_of_another_place_is_not_measured(tmp_path):
@@ -318,10 +318,10 @@ def test_a_test_view_of_another_place_is_not_measured(tmp_path):
     (tmp_path / "ball/transforms_test.json").write_text(json.dumps(data))
     assert train(folder, tmp_path / "run")[0] == 0
     status, lines = spoken(["eval", tmp_path / "run"])
-    told = "test: 1 of 4 views left out: their masks miss the model (train/r_6.png)"
-    assert status == 0 and any(told in line for line in lines), lines
+    message = "test: 1 of 4 views left out: their masks miss the model (train/r_6.png)"
+    assert status == 0 and any(message in line for line in lines), lines
     measured = json.loads((tmp_path / "run/eval/metrics.json").read_text())["per_image"]
-    assert [one["name"] for one in measured] == ["train/r_0.png", "train/r_3.png", "train/r_9.png"]
+    assert [row["name"] for row in measured] == ["train/r_0.png", "train/r_3.png", "train/r_9.png"]
 
 
 def test_figures_of_a_scene_count_no_view_that_is_left_out(dev, tmp_path):

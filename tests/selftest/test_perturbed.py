@@ -128,7 +128,7 @@ NAIVE = [
 
 def test_every_text_stands_once_in_its_file():
     planted = [*FLIPS, *NAIVE]
-    assert [one for one in planted if path_of(one[0]).read_text().count(one[1]) != 1] == []
+    assert [fault for fault in planted if path_of(fault[0]).read_text().count(fault[1]) != 1] == []
     assert [flip for flip in FLIPS if abs(len(flip[1]) - len(flip[2])) > 1] == []
 
 

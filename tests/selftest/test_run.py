@@ -58,11 +58,11 @@ def test_a_case_without_checks_has_checked_nothing():
 
 def test_a_hard_case_shows_the_check_in_which_the_naive_formula_is_worst():
     checks = Check(0.9, 1.0), Check(0.5, 1.0, 4.0), Check(0.2, 1.0, np.nan), Check(0, 0, np.inf)
-    for some, expected in ((checks[:2], (4, 0.5, 1)), (checks, (np.nan, 0.2, 1))):
-        row = run_case(None, case(*some, hard="1 / 0"))
+    for chosen, expected in ((checks[:2], (4, 0.5, 1)), (checks, (np.nan, 0.2, 1))):
+        row = run_case(None, case(*chosen, hard="1 / 0"))
         assert row.hard.what == "1 / 0" and (row.error, row.bound) == (0.9, 1.0)
-        found = row.hard.naive, row.hard.error, row.hard.bound
-        np.testing.assert_equal(found, expected)
+        worst = row.hard.naive, row.hard.error, row.hard.bound
+        np.testing.assert_equal(worst, expected)
     assert run_case(None, case(*checks)).hard is None
 
 

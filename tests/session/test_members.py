@@ -37,7 +37,7 @@ def test_the_mean_of_their_images_is_shown(both, dev):
     run, second = load(both, dev), load(both / "member-2", dev)
     camera = run.cameras()[0]
     colour = run.render(camera).colour
-    alone = [one.renderer.render(camera, one.gamma) for one in (run, second)]
+    alone = [member.renderer.render(camera, member.gamma) for member in (run, second)]
     np.testing.assert_allclose(colour, np.mean(alone, 0), atol=1e-6)
     assert np.abs(alone[0] - alone[1]).max() > 0.01
     mean = evaluate_run(run, metrics=("psnr",))["mean"]["psnr"]

@@ -55,7 +55,7 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
     scene = write_ball_scene(tmp_path / "ball", size=size)
     settings |= {"train.iterations": 24, "train.prune_weight": 0}
     folder = RunFolder(tmp_path / "run")
-    config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
+    config = run_config(folder, scene, "tiny", [(*setting, "test") for setting in settings.items()])
     training = open_training(plain, folder, config, None)
     training.run()
     need = training.memory_plan.need
@@ -87,17 +87,17 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     words = ["train", scene, "--out", str(folder), "--downscale", "1", "--points", "4000"]
     words += ["--memory", "0.1", "--iterations", "24", "--set", "train.prune_weight=0"]
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", told)
-    assert "features: of one sample a pixel in the end (--memory 0.1" in told
+    text = capsys.readouterr().out
+    assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", text)
+    assert "features: of one sample a pixel in the end (--memory 0.1" in text
     train = load_config(folder.config).train
     assert train.refine_at == (0.35, 1) and train.supersampled == 0
-    plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", told)[1]) * MIB
+    plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", text)[1]) * MIB
     assert FILLED - 0.05 < plan / (0.1 * GIB) < FILLED + 0.001
     assert 0.85 < plan / card.peak_bytes < 1.15
     assert max(math.prod(group) for _, group in card.launched) == 256
     limit = cl.kernel_work_group_info.LOCAL_MEM_SIZE
-    local = [one._kernel.get_work_group_info(limit, card.device) for one, _ in card.launched]
+    local = [kernel._kernel.get_work_group_info(limit, card.device) for kernel, _ in card.launched]
     assert 0 < max(local) <= 32 * 1024
 
 
@@ -162,16 +162,16 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
 def test_views_that_decide_on_pruning_have_one_sample_a_pixel(dev):
     """They take the most memory where images are much larger than crops."""
     few = {"train__iterations": "24", "size": (1600, 1200)}
-    one, four = (needed(dev, train__supersampled=share, **few) for share in ("0", "0.25"))
-    assert four.device == one.device
+    single, four = (needed(dev, train__supersampled=share, **few) for share in ("0", "0.25"))
+    assert four.device == single.device
 
 
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
     made = memory_plan(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
     finer = Grid(GRID.origin, GRID.voxel_size / 2, tuple(2 * n for n in GRID.dims))
-    planned, found = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
-    assert planned.points == found.points == 160_000
-    assert found.device == pytest.approx(planned.device, rel=0.01)
+    planned, later = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
+    assert planned.points == later.points == 160_000
+    assert later.device == pytest.approx(planned.device, rel=0.01)
 
 
 def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
@@ -185,8 +185,8 @@ def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
 
 def test_images_are_counted_as_they_are_kept(dev):
     sizes = {"size": (4000, 3000), "scene__downscale": "8"}
-    one, many = (needed(dev, images=count, **sizes).host for count in (300, 400))
-    assert many - one == 100 * 500 * 375 * 4
+    fewer, more = (needed(dev, images=count, **sizes).host for count in (300, 400))
+    assert more - fewer == 100 * 500 * 375 * 4
 
 
 def check(made, points=20_000):
@@ -277,8 +277,8 @@ def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_lear
 
     plain.info["memory_bytes"] = 20 * MIB
     words = arguments(scene, tmp_path / "run", **settings)
-    told = failure(*words)
-    assert "step 19: to go on with " in told and told.endswith("in another --out")
+    error = failure(*words)
+    assert "step 19: to go on with " in error and error.endswith("in another --out")
     plain.info["memory_bytes"] = GIB
     assert main(words) == 0
     assert "resuming at step 19 " in capsys.readouterr().out

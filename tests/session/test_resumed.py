@@ -27,8 +27,8 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
     assert main(["train", "--out", str(finished)]) == 0  # the scene is taken from the run, too
     assert capsys.readouterr().out.count("is finished (60 steps)") == 3
     assert failure("train", "--out", finished / "other").startswith("pp-cl: SCENE: ")
-    told = failure(*words, "--points", "1600", "--iterations", "61")
-    assert "points.count is 1500 in this run, but 1600 is asked for" in told
+    error = failure(*words, "--points", "1600", "--iterations", "61")
+    assert "points.count is 1500 in this run, but 1600 is asked for" in error
 
 
 def measured_psnr(out):

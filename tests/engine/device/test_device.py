@@ -142,9 +142,9 @@ def test_a_driver_that_gives_up_is_a_user_error(plain, error):
     with pytest.raises(error if error is cl.LogicError else UserError) as caught:
         plain.attempt("run x.cl:y", refuse, 1)
     if error is not cl.LogicError:
-        said = r"\S.* cannot run x.cl:y for want of memory, or since the driver ended a kernel \(.*"
+        text = r"\S.* cannot run x.cl:y for want of memory, or since the driver ended a kernel \(.*"
         assert re.match(
-            said + "OUT_OF_RES.*lower --points.*the log of the system", str(caught.value)
+            text + "OUT_OF_RES.*lower --points.*the log of the system", str(caught.value)
         )
 
 

@@ -57,10 +57,10 @@ def test_a_launch_computes(program, dev, rows):
     ],
 )
 def test_sizes_are_rounded_up_to_the_work_group(program, rows, monkeypatch, size, local, enqueued):
-    seen = []
-    monkeypatch.setattr(cl, ENQUEUE, lambda queue, kernel, *args: seen.append(args[:2]))
+    ranges = []
+    monkeypatch.setattr(cl, ENQUEUE, lambda queue, kernel, *args: ranges.append(args[:2]))
     program.launch("rows", size, local=local, **rows)
-    assert seen == [enqueued]
+    assert ranges == [enqueued]
 
 
 def test_a_size_of_zero_launches_nothing(program, rows):
@@ -83,14 +83,14 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
 ):
     monkeypatch.setattr(device_module, "MOST_MULTIPLY_ADDS", 100)
     monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
-    seen, flushed, enqueued, queue = [], [], getattr(cl, ENQUEUE), dev.queue
+    ranges, flushed, enqueued, queue = [], [], getattr(cl, ENQUEUE), dev.queue
 
     class Watched:
         def flush(self):
-            flushed.append(len(seen))
+            flushed.append(len(ranges))
 
     def enqueue(_, kernel, size, local, offset):
-        seen.append((offset, size))
+        ranges.append((offset, size))
         return enqueued(queue, kernel, size, local, offset)
 
     x = rows["x"].get()
@@ -101,7 +101,7 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
         patch.setattr(dev, "queue", Watched())
         patch.setattr(cl, ENQUEUE, enqueue)
         program.launch("rows", n, multiply_adds=multiply_adds, **rows)
-    assert seen == launched
+    assert ranges == launched
     # each part is flushed on its own
     watched = has_watchdog and multiply_adds > 0
     assert flushed == (list(range(1, len(launched) + 1)) if watched else [])

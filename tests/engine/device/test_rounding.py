@@ -36,8 +36,8 @@ def test_no_worse_than_opencl_allows(dev, rng, tmp_path, monkeypatch):
     )
     exact = a.astype(np.float64) / b, np.sqrt(a.astype(np.float64))
     division, root = (
-        float((np.abs(found.get() - value) / np.spacing(value.astype(np.float32))).max())
-        for found, value in zip((quotient, root), exact, strict=True)
+        float((np.abs(computed.get() - value) / np.spacing(value.astype(np.float32))).max())
+        for computed, value in zip((quotient, root), exact, strict=True)
     )
     assert division <= DIVISION_ULP and root <= ROOT_ULP
     if "-cl-fast-relaxed-math" in os.environ.get("PYOPENCL_BUILD_OPTIONS", ""):

@@ -34,15 +34,15 @@ def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
     layer = Layer.random(rng, size, (16, 16), co, k)
     counts = random_counts(rng, *size)
     tiles, count = some_tiles(dev, size, counts), pixels_of(counts, *size)[..., None]
-    whole, some = layer.computed(dev, variant, CPU), layer.computed(dev, variant, CPU, tiles)
+    whole, chosen = layer.computed(dev, variant, CPU), layer.computed(dev, variant, CPU, tiles)
     for i in (0, 3, 4):  # the output and the gradients of the inputs
-        np.testing.assert_array_equal(some[i], np.where(count > 0, whole[i], np.nan))
-    seen = pixels_of(grow(counts > 0, k // 2), *size)[..., None]
-    parts = [np.where(seen, part, np.float32(np.nan)) for part in layer.parts]
+        np.testing.assert_array_equal(chosen[i], np.where(count > 0, whole[i], np.nan))
+    is_read = pixels_of(grow(counts > 0, k // 2), *size)[..., None]
+    parts = [np.where(is_read, part, np.float32(np.nan)) for part in layer.parts]
     poisoned = np.where(count > 0, layer.grad_out, np.float32(np.nan))
-    given = layer.weight, layer.bias
-    actual = Layer(parts, *given, poisoned).computed(dev, variant, CPU, tiles)
-    expected = Layer(layer.parts, *given, layer.grad_out * count).expected
+    weights = layer.weight, layer.bias
+    actual = Layer(parts, *weights, poisoned).computed(dev, variant, CPU, tiles)
+    expected = Layer(layer.parts, *weights, layer.grad_out * count).expected
     for i in (1, 2):  # the gradients of the weights and the bias
         assert relative_error(actual[i], expected[i]) < 1e-5
 
@@ -76,10 +76,10 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
     program = dev.program
 
     def limited(*args, **defines):
-        found = program(*args, **defines)
-        for kernel in found.kernels.values():
+        compiled = program(*args, **defines)
+        for kernel in compiled.kernels.values():
             patch.setattr(kernel, "largest_group", 48)
-        return found
+        return compiled
 
     # launched first, as a size is not checked again
     with monkeypatch.context() as patch:

@@ -64,11 +64,11 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
         size = start.shape[:2]
         counts, result = random_counts(rng, *size), dev.upload(start)
         tiles, chosen = some_tiles(dev, size, counts), pixels_of(counts > 0, *size)
-        call(dev, *[dev.upload(given) for given in inputs], result, tiles=tiles)
+        call(dev, *[dev.upload(array) for array in inputs], result, tiles=tiles)
         np.testing.assert_array_equal(result.get()[~chosen], start[~chosen])
         assert relative_error(result.get()[chosen], expected[chosen]) < 2e-6, call.__name__
         with pytest.raises(ValueError, match="tile_count has shape"):
-            call(dev, *[dev.upload(given) for given in inputs], result, tiles=others)
+            call(dev, *[dev.upload(array) for array in inputs], result, tiles=others)
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,9 @@ def test_gradients_against_finite_differences(dev, rng, rule, gamma):
     assert relative_error(gradients["opacity"][zero], one_sided) < 1e-3
     assert np.abs(one_sided).max() > 0.1
 
-    some = rng.choice(60 * 16, 50, replace=False)
-    numeric = numeric_gradient(lambda f: loss(opacity, f), blended.point_features, 1e-4, some)
-    assert relative_error(gradients["features"].ravel()[some], numeric) < 1e-4
+    indices = rng.choice(60 * 16, 50, replace=False)
+    numeric = numeric_gradient(lambda f: loss(opacity, f), blended.point_features, 1e-4, indices)
+    assert relative_error(gradients["features"].ravel()[indices], numeric) < 1e-4
 
 
 def test_gradients_of_the_distortion_loss_against_finite_differences(dev, rng):
@@ -80,8 +80,8 @@ def test_gradients_of_the_depth_loss_against_finite_differences(dev, rng):
         return bending(surface(opacity)[1].reshape(scene.shape), has_surface)[0]
 
     view = scene.projected, scene.pairs, scene.weights, scene.shape
-    found = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=1.0)
-    gradients = scene.gradients(blended.grad, depth_gradient=found)["opacity"]
+    depth_grad = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=1.0)
+    gradients = scene.gradients(blended.grad, depth_gradient=depth_grad)["opacity"]
     inside = np.flatnonzero((opacity > 0) & (opacity < 1))
     numeric = numeric_gradient(loss, opacity, 1e-6, inside)
     assert np.abs(numeric).max() > 1e-3
@@ -105,9 +105,9 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha")
     through = scene.weights.transmittance.get().ravel()
     np.testing.assert_array_equal(np.isnan(through), scene.fragments()[point])
-    highest, seen = dev.zeros((31,)), dev.zeros((31,))
+    highest, times_seen = dev.zeros((31,)), dev.zeros((31,))
     listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen)
     assert np.isnan(highest.get()[point])
 
 

@@ -33,11 +33,13 @@ def test_fragments_that_were_counted_otherwise_stay_within_their_point(dev, rng,
     planted = replace(scene.projected, point_count=dev.upload(counts + change, np.uint32))
     pairs = find_all_pairs(dev, Buffers(dev), planted, scene.shape)
     assert pairs.total == (counts + change).sum()
-    for one, other, difference in zip(by_point(scene.pairs), by_point(pairs), change, strict=True):
-        both = min(len(one[0]), len(other[0]))
-        assert len(other[0]) - len(one[0]) == difference
-        assert all(np.array_equal(a[:both], b[:both]) for a, b in zip(one, other, strict=True))
-        assert (other[1][both:] == 0).all()
+    for before, after, difference in zip(
+        by_point(scene.pairs), by_point(pairs), change, strict=True
+    ):
+        both = min(len(before[0]), len(after[0]))
+        assert len(after[0]) - len(before[0]) == difference
+        assert all(np.array_equal(a[:both], b[:both]) for a, b in zip(before, after, strict=True))
+        assert (after[1][both:] == 0).all()
     pixels, keys = pairs.pair_pixel.get()[: pairs.total], pairs.pair_key.get()[: pairs.total]
     assert np.array_equal(np.sort(keys & 0xFFFFFFFF), np.arange(pairs.total))
     listed = np.diff(pairs.pixel_offset.get().astype(np.int64))
@@ -60,10 +62,10 @@ def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
     pairs = PairedPoints(dev, camera, positions, 1e-4, kind="disc").pairs
     offsets, keys = pairs.pixel_offset.get().astype(np.int64), pairs.pair_key.get()[: pairs.total]
     assert tuple(np.diff(offsets)) == lengths
-    found = pairs.pair_pixel.get()[(keys & 0xFFFFFFFF).astype(np.int64)]
-    assert np.array_equal(found, np.repeat(np.arange(len(lengths)), lengths))
+    pixels = pairs.pair_pixel.get()[(keys & 0xFFFFFFFF).astype(np.int64)]
+    assert np.array_equal(pixels, np.repeat(np.arange(len(lengths)), lengths))
     assert len(np.unique(keys & 0xFFFFFFFF)) == pairs.total
-    assert (keys[1:] > keys[:-1])[found[1:] == found[:-1]].all()
+    assert (keys[1:] > keys[:-1])[pixels[1:] == pixels[:-1]].all()
 
 
 def bits(pairs):

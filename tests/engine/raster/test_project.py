@@ -44,16 +44,16 @@ def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, k
         ).point_count.get()
 
     crops = [whole.crop(x, y, 32, 32) for x in range(0, 320, 32) for y in range(0, 240, 24)]
-    found = [counts(crop) for crop in crops]
-    assert 0.01 < np.mean([(count > 0).mean() for count in found]) < 0.2
+    point_counts = [counts(crop) for crop in crops]
+    assert 0.01 < np.mean([(count > 0).mean() for count in point_counts]) < 0.2
     monkeypatch.setattr(project, "MOST_OFFSET", 1e6)  # bricks reach everywhere
     assert all(
-        np.array_equal(count, counts(crop)) for count, crop in zip(found, crops, strict=True)
+        np.array_equal(count, counts(crop)) for count, crop in zip(point_counts, crops, strict=True)
     )
     monkeypatch.setattr(project, "MOST_OFFSET", -3.5)  # bricks end before their middle
     culls = dev.is_cpu  # GPUs judge each point alone
     assert (
-        any((count != counts(crop)).any() for count, crop in zip(found, crops, strict=True))
+        any((count != counts(crop)).any() for count, crop in zip(point_counts, crops, strict=True))
         == culls
     )
 
@@ -66,6 +66,6 @@ def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation,
         scene = PairedPoints(dev, camera, position, deviation, kind="gaussian")
         exact = dense.geometry(viewer, position, deviation, "gaussian")
         drawn = np.where(exact["fragment"], exact["falloff"], 0).reshape(30, 3, 30, 3)
-        found = scene.geometry()["falloff"].reshape(30, 30)
-        assert found.max() > 0.1
-        np.testing.assert_allclose(found, drawn.mean((1, 3)), atol=bound)
+        falloff = scene.geometry()["falloff"].reshape(30, 30)
+        assert falloff.max() > 0.1
+        np.testing.assert_allclose(falloff, drawn.mean((1, 3)), atol=bound)

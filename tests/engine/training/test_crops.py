@@ -23,13 +23,13 @@ def jitters(view, **settings):
 
 
 def test_a_reduced_view_has_all_blocks_of_stored_pixels():
-    found = jitters(OPAQUE.reduced(2))
-    assert {tuple(jitter) for jitter in found.tolist()} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    shifts = jitters(OPAQUE.reduced(2))
+    assert {tuple(jitter) for jitter in shifts.tolist()} == {(0, 0), (0, 1), (1, 0), (1, 1)}
 
 
 def test_a_view_at_its_own_size_is_shifted_between_its_pixels():
-    found = jitters(OPAQUE)
-    assert np.abs(found).max() <= BETWEEN and (np.ptp(found, axis=0) > 1.8 * BETWEEN).all()
+    shifts = jitters(OPAQUE)
+    assert np.abs(shifts).max() <= BETWEEN and (np.ptp(shifts, axis=0) > 1.8 * BETWEEN).all()
 
 
 @pytest.mark.parametrize("downscale", (1, 2))

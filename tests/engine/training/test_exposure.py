@@ -78,12 +78,12 @@ def test_matrices_are_found_and_a_training_goes_on_with_them(dev, tmp_path, monk
     result = json.loads((whole / "eval" / "metrics.json").read_text())
     assert result["mean_after_colour"]["psnr"] > result["mean"]["psnr"] + 1
     train_and_interrupt(scene, run, STEPS - 1, monkeypatch, **SETTINGS)
-    found = load_checkpoint(run / "checkpoint.npz")[1]["exposure"][:, 16:, :3]
-    assert found.mean(axis=0) == pytest.approx(np.eye(3), abs=1e-5)
+    matrices = load_checkpoint(run / "checkpoint.npz")[1]["exposure"][:, 16:, :3]
+    assert matrices.mean(axis=0) == pytest.approx(np.eye(3), abs=1e-5)
     off = tmp_path / "off"
     assert main(arguments(scene, off, train__exposure="off", **SETTINGS)) == 0
-    one, other = (np.mean([row["psnr"] for row in rows(out)[-6:-1]]) for out in (whole, off))
-    assert one > other + 1
+    learned, without = (np.mean([row["psnr"] for row in rows(out)[-6:-1]]) for out in (whole, off))
+    assert learned > without + 1
     assert main(["train", scene, "--out", str(run)]) == 0
     checkpoints = [folder / "checkpoint.npz" for folder in (whole, run)]
     assert checkpoints[0].read_bytes() == checkpoints[1].read_bytes()
@@ -112,8 +112,8 @@ def test_a_view_gets_the_colour_of_its_other_half(rng):
     alpha = rng.random((49, 37))
     colour, white = rng.random((49, 37, 3)) * alpha[..., None], 1 - alpha[..., None]
     turned = colour @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))) + 0.05 * alpha[..., None]
-    found = coloured_alike(white + colour, white + turned, alpha)
-    np.testing.assert_allclose(found, np.clip(white + turned, 0, 1), atol=0.01)
+    recoloured = coloured_alike(white + colour, white + turned, alpha)
+    np.testing.assert_allclose(recoloured, np.clip(white + turned, 0, 1), atol=0.01)
 
 
 def test_equal_exposures_change_no_bit(dev, tmp_path):

@@ -23,11 +23,11 @@ def test_oracle_gradient_is_the_derivative(rng, beta):
     prediction, target = images(rng, 14, 13)
     assert np.abs(prediction - target).min() > 1e-6  # else L1 has a kink inside the difference
     _, grad = oracle_loss.loss(prediction, target, 0.7, beta)
-    some = range(0, prediction.size, 5)  # in all rows, columns and colours
+    indices = range(0, prediction.size, 5)  # in all rows, columns and colours
     numeric = numeric_gradient(
-        lambda p: oracle_loss.loss(p, target, 0.7, beta)[0][0], prediction, 5e-7, some
+        lambda p: oracle_loss.loss(p, target, 0.7, beta)[0][0], prediction, 5e-7, indices
     )
-    assert relative_error(grad.ravel()[some], numeric) < 1e-6
+    assert relative_error(grad.ravel()[indices], numeric) < 1e-6
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.1])

@@ -80,11 +80,11 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
     cloud = Cloud(dev, rng, 31)
     for _ in range(3):
         cloud.step(gradients(rng, 31), np.arange(31), rates=replace(RATES, sh=rates))
-    found = cloud.learned()["sh"]
-    assert relative_error(found, cloud.twin.values["sh"]) < 1e-6
+    sh = cloud.learned()["sh"]
+    assert relative_error(sh, cloud.twin.values["sh"]) < 1e-6
     for degree, rate in enumerate(rates):
         part = np.s_[:, degree**2 : (degree + 1) ** 2]
-        assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)
+        assert (sh[part] == cloud.start["sh"][part]).all() == (rate == 0)
 
 
 def test_an_opacity_moves_as_it_changes_with_what_is_learned(dev, rng):

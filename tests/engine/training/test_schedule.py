@@ -119,12 +119,12 @@ def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
 )
 def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limit):
     """Uniform draws would hardly ever; pixels between are still seen at least half as often."""
-    seen, draws = np.zeros(limit), 3000
+    coverage, draws = np.zeros(limit), 3000
     for i in range(draws):
         start = draw_start(np.random.default_rng(i), low, high, size, limit=limit)
-        seen[start : start + size] += 1 / draws
-    ends = seen[[low + BOX_MARGIN, high - BOX_MARGIN - 1]]
+        coverage[start : start + size] += 1 / draws
+    ends = coverage[[low + BOX_MARGIN, high - BOX_MARGIN - 1]]
     assert ends == pytest.approx(END_SHARE, abs=0.03)
-    inner = seen[low + BOX_MARGIN : high - BOX_MARGIN]
+    inner = coverage[low + BOX_MARGIN : high - BOX_MARGIN]
     fair = size / (high - low)
     assert inner.min() > min(0.5 * fair, END_SHARE - 0.03)

@@ -117,15 +117,15 @@ def test_its_gradient_is_that_of_finite_differences(dev, rng):
     _, parts = layer.backward(gradient)
     gradients = plain_parameters(layer, layer.sum_gradients(parts))
     parameters = plain_parameters(layer, layer.parameters)
-    for name, found in gradients.items():
+    for name, computed in gradients.items():
 
         def loss(values, name=name):
             image = network(layer.layers, parameters | {name: values}, x)["image"]
             return np.square(image - wanted).mean()
 
-        some = rng.choice(found.size, min(found.size, 20), replace=False)
-        expected = numeric_gradient(loss, parameters[name], 1e-6, some)
-        assert found.ravel()[some] == pytest.approx(expected, rel=1e-3, abs=1e-7)
+        indices = rng.choice(computed.size, min(computed.size, 20), replace=False)
+        expected = numeric_gradient(loss, parameters[name], 1e-6, indices)
+        assert computed.ravel()[indices] == pytest.approx(expected, rel=1e-3, abs=1e-7)
 
 
 # ---- in trainings

@@ -120,9 +120,9 @@ def test_the_state_follows(dev, rng):
 
 @pytest.mark.parametrize("blend", ["alpha", "softmax"])
 def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
-    given = {"points.count": 300, "raster.blend": blend, "train.refine_at": "0.5,1"}
-    given["scene.downscale"] = 1
-    config = configure(preset("tiny"), scene, [(k, v, "test") for k, v in given.items()])
+    settings = {"points.count": 300, "raster.blend": blend, "train.refine_at": "0.5,1"}
+    settings["scene.downscale"] = 1
+    config = configure(preset("tiny"), scene, [(k, v, "test") for k, v in settings.items()])
     trainer = open_training(dev, RunFolder(tmp_path / "run"), config, None).trainer
     trainer.optimiser.update_ema(1.0)
     opacities = trainer.model.cloud, trainer.state.averages

@@ -105,14 +105,18 @@ def test_a_model_that_colmap_wrote(tmp_path, form):
     numbers = (0, 9, 20, 31, 42, 53)
     for i in numbers:
         write_png(tmp_path / "images" / f"{i:03d}.png", np.zeros((400, 400)))
-    found = [one for split in ("test", "train") for one in read_split(tmp_path, split, [])]
-    assert [one.name for one in found] == [f"images/{i:03d}.png" for i in numbers]
-    for one in found:
-        camera, k1 = one.camera, -0.0025245658661648311
+    image_files = [
+        image_file for split in ("test", "train") for image_file in read_split(tmp_path, split, [])
+    ]
+    assert [image_file.name for image_file in image_files] == [
+        f"images/{i:03d}.png" for i in numbers
+    ]
+    for image_file in image_files:
+        camera, k1 = image_file.camera, -0.0025245658661648311
         assert camera.fx == camera.fy == 323.03151019681525 and (camera.cx, camera.cy) == (200, 200)
-        assert one.lens == LensDistortion(k1=k1)
+        assert image_file.lens == LensDistortion(k1=k1)
     true = cameras(400)
-    alignment = align([one.camera for one in found], [true[i] for i in numbers])
+    alignment = align([image_file.camera for image_file in image_files], [true[i] for i in numbers])
     assert alignment.position < 0.02 and alignment.degrees < 0.2
 
 
@@ -132,7 +136,7 @@ def test_text_as_other_programs_write_it(text):
         assert got.name == expected.name and np.array_equal(got.camera.pose, expected.camera.pose)
     for file in (text / "sparse/0").glob("*.txt"):
         file.write_text(file.read_text("utf-8-sig"), encoding="utf-16")
-    assert [one.name for one in read_split(text, "train", [])] == [one.name for one in before]
+    assert [view.name for view in read_split(text, "train", [])] == [view.name for view in before]
 
 
 def test_2d_points_take_no_memory(tmp_path):
@@ -232,7 +236,7 @@ def test_of_several_models_the_largest_is_read(written):
     for file in (*(folder / "images").iterdir(), *(folder / "sparse/3").iterdir()):
         file.rename(folder / file.name)  # RealityScan writes images and model to one folder
     shutil.rmtree(folder / "sparse")
-    assert [one.name for one in scene_frames(folder)][:2] == ["000001.png", "000002.png"]
+    assert [view.name for view in scene_frames(folder)][:2] == ["000001.png", "000002.png"]
 
 
 def test_models_of_later_versions_are_named(binary):

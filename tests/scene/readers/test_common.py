@@ -44,8 +44,8 @@ def made(tmp_path):
     """
 
     def make(name):
-        given = held_out(views(centred=name == "llff", alike=name in ("llff", "nsvf")))
-        convert(given, tmp_path / "scene", name)
+        splits = held_out(views(centred=name == "llff", alike=name in ("llff", "nsvf")))
+        convert(splits, tmp_path / "scene", name)
         folder = tmp_path / "scene" / ("object/sequence" if name == "co3d" else ".")
         images, masks = FOLDERS[name]
         return folder, folder / images, masks and folder / masks
@@ -60,9 +60,9 @@ def test_links_of_the_user_are_followed(made, name):
     escape(sorted(places[0].iterdir())[2])
     for place in filter(None, places):
         escape(place)
-    for one, other in zip(before, load_scene(folder).splits["train"], strict=True):
-        assert one.name == other.name
-        np.testing.assert_array_equal(one.image, other.image)
+    for view, other in zip(before, load_scene(folder).splits["train"], strict=True):
+        assert view.name == other.name
+        np.testing.assert_array_equal(view.image, other.image)
 
 
 def cut(file):
@@ -100,12 +100,12 @@ def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(
     where, (do, why) = images if place == "image" else masks, HARM[harm]
     before = {view.name: view.stored_camera for view in load_scene(folder).splits["train"]}
     do(sorted(where.iterdir())[2])
-    with pytest.warns(UserWarning, match=f"train: 1 of 9 views left out: ({why})") as told:
-        left = load_scene(folder)
-    assert len(told) == 1 and len(left.notes) == 1
-    names = [view.name for view in left.splits["train"]]
+    with pytest.warns(UserWarning, match=f"train: 1 of 9 views left out: ({why})") as warned:
+        scene = load_scene(folder)
+    assert len(warned) == 1 and len(scene.notes) == 1
+    names = [view.name for view in scene.splits["train"]]
     assert names == [name for name in before if name in names] and len(names) == 8
-    for view in left.splits["train"]:
+    for view in scene.splits["train"]:
         assert np.array_equal(view.stored_camera.pose, before[view.name].pose)
     do(sorted(where.iterdir())[4])
     refused(folder, folder.parent if folder.name == "sequence" else folder)
@@ -120,8 +120,8 @@ def test_images_that_were_reduced(made, name):
     before = scene_frames(folder)
     for level, file in enumerate(sorted(images.iterdir())):
         write_png(file, np.full((11, 15), level / 20))
-    for got, one in zip(scene_frames(folder), before, strict=True):
-        half = one.camera.downscaled(2)
+    for got, full in zip(scene_frames(folder), before, strict=True):
+        half = full.camera.downscaled(2)
         np.testing.assert_allclose(got.camera.packed((1, 2)), half.packed((1, 2)), atol=1e-5)
         assert (type(got.camera.width), type(got.camera.height)) == (int, int)
 

@@ -30,12 +30,12 @@ def edit(folder, change):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-4, 3e5])
 def test_a_projection_is_known_up_to_its_scale(tmp_path, scale):
-    given = held_out(views())
-    neus.write(tmp_path, given)
+    splits = held_out(views())
+    neus.write(tmp_path, splits)
     edit(tmp_path, lambda a: a.update({name: scale * matrix for name, matrix in a.items()}))
     for name, other in ((FILE, "cameras.npz"), ("image", "images"), ("mask", "masks")):
         (tmp_path / name).rename(tmp_path / other)
-    same(tmp_path, given)
+    same(tmp_path, splits)
 
 
 def test_a_projection_by_hand(tmp_path):
@@ -122,10 +122,10 @@ def test_bad_cameras(scene, case):
 
 def test_masks_belong_to_images_of_their_number(scene, dev):
     """In DTU, mask/000.png belongs to image/000000.png; a mask of another number to none."""
-    before = [one.name for one in scene_frames(scene)]
+    before = [view.name for view in scene_frames(scene)]
     for file in (scene / "mask").iterdir():
         file.rename(file.with_name(f"{int(file.stem):03d}.png"))
-    assert [Path(one.mask).stem for one in scene_frames(scene)] == [
+    assert [Path(view.mask).stem for view in scene_frames(scene)] == [
         Path(name).stem[3:] for name in before
     ]
     (scene / "mask" / "010.png").rename(scene / "mask" / "011.png")

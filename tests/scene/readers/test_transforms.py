@@ -35,8 +35,8 @@ def test_projection_follows_opengl(tmp_path, rng):
         point = rng.normal(size=3) * 0.3
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
         expected = [SIZE[0] / 2 + focal * x / -z, SIZE[1] / 2 - focal * y / -z]
-        *found, depth = view.camera.project(point)
-        assert depth > 0 and np.allclose(found, expected, rtol=0, atol=1e-9)
+        *pixel, depth = view.camera.project(point)
+        assert depth > 0 and np.allclose(pixel, expected, rtol=0, atol=1e-9)
 
 
 def test_nerfstudio_names(tmp_path):
@@ -83,7 +83,7 @@ def test_a_path_without_the_ending_of_its_image(tmp_path, ending):
     data |= {"train_filenames": [r".\train_0.png", f"train_1{ending}"]}
     (tmp_path / "transforms_train.json").unlink()
     (tmp_path / "transforms.json").write_text(json.dumps(data))
-    names = [one.name for one in load_scene(tmp_path).splits["train"]]
+    names = [view.name for view in load_scene(tmp_path).splits["train"]]
     assert names == ["train_0.png", f"train_1{ending}"]
 
 
@@ -208,8 +208,8 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     """colmap2nerf writes the tangential coefficients, too, as zeros."""
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
-    [one, *_] = transforms.read_split(tmp_path, "train", [])
-    assert one.lens == LensDistortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
+    [view, *_] = transforms.read_split(tmp_path, "train", [])
+    assert view.lens == LensDistortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
     write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
 
