@@ -131,11 +131,8 @@ def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[S
     for end in sorted(ends | {train.iterations}):
         if step < end:
             now = max(start, step)
-            refinements, supersampling = (
-                sum(now < at for at in refined),
-                supersampling_at(now, train),
-            )
-            yield Stretch(points, refinements, averaged <= now, supersampling)
+            refinements = sum(now < at for at in refined)
+            yield Stretch(points, refinements, averaged <= now, supersampling_at(now, train))
             stage = max(at for at in stages if at <= start), min(at for at in stages if at >= end)
             to_come = prunings(train, now, end) / max(1, prunings(train, *stage))
             points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)
