@@ -346,7 +346,9 @@ def _resumed(folder, stored, scene, given):
     for key, section, item in every_setting(config):
         there = getattr(getattr(stored, key.partition(".")[0]), item.name)
         asked = getattr(section, item.name)
-        if asked != there and key not in free:
+        if key in stored.automatic and asked == item.default:
+            setattr(section, item.name, there)  # what the training has chosen
+        elif asked != there and key not in free:
             refuse_setting(folder, key, there, asked)
     return config
 

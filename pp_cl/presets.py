@@ -5,7 +5,7 @@ from typing import Any
 # Settings that differ from the defaults in settings.py. These are tiny: minutes on a CPU.
 PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {},
-    # for images of 400 x 400: training begins at half the size and takes 20 minutes on a CPU
+    # for images of 400 x 400: training begins at half the size
     "small": {
         "points.count": 170_000,
         "train.iterations": 6_000,

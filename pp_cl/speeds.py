@@ -24,8 +24,8 @@ from pp_cl.files.atomic import make_cache_folder, write_json
 Listed = tuple[str, cl.Device, str | None]
 
 SPEEDS = "speeds.json"
-# Another CPU driver is preferred to Intel's only if it is this many times as fast: README says that
-# the whole demo takes PoCL 5 % longer, although some convolutions are faster with it.
+# Another CPU driver is preferred to Intel's only if it is this many times as fast: the whole
+# demo takes PoCL longer, although some convolutions are faster with it.
 CLEARLY = 2.0
 SIDE, CHANNELS = 96, 64  # of the 3x3 convolution: the middle of the U-Net of `small`
 SECONDS = 1.0  # per device

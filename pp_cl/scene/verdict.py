@@ -22,7 +22,7 @@ from pp_cl.scene.listing import DEMO, find_reader, list_split, scene_box, scene_
 from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.settings import Config
 
-# The mean share of a mask beside the hull is 0 to 0.016 in sound scenes, and 0.15 and more with
+# The mean share of a mask beside the hull is 0 to 0.016 in sound scenes, and 0.13 and more with
 # wrong cameras (docs/scenes.md). With a quarter of the masks forgiven it is 0.016 and more with
 # wrong cameras, and 0 if half of the masks lack a part.
 MOST_BESIDE, PERSISTING = 0.06, 0.005

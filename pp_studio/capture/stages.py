@@ -4,6 +4,7 @@ SCENE/capture/STAGE.json and an image of it in STAGE.png; the same command conti
 
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -304,6 +305,9 @@ class Capture:
         world = box.find_world(cameras, poses.points(model)[0])
         given_box = self.options["box"]
         chosen = world.box if given_box is None else np.sort(np.reshape(given_box, (2, 3)), axis=0)
+        if given_box is not None and read_edits(self.scene).box is not None:
+            what = "has a box, which is used in place of --box; remove it there to use --box"
+            warnings.warn(f"{self.scene / 'pp_cl.json'}: {what}", stacklevel=2)
         _move(model, world.scale, world.rotation, world.shift)
         eyes = [image_file.camera.eye for image_file in poses.image_files(model)]
         distance = np.median(np.linalg.norm(eyes, axis=1))

@@ -60,9 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--minutes",
         type=shared.number(0.1, MOST_MINUTES),
         metavar="N",
-        help=f"minutes for all of it ({MINUTES:g}; a third of them is the training's, also where"
-        " cameras and masks take longer); with more of them a finished model is trained on, or, if"
-        " they allow for larger images, anew",
+        help=f"minutes for all of it ({MINUTES:g}; the training gets at least a third of them, also"
+        " where cameras and masks take longer); with more of them a finished model is trained on,"
+        " or, if they allow for larger images, anew",
     )
     add(
         "--preset",

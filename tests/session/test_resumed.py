@@ -31,6 +31,14 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
     assert "points.count is 1500 in this run, but 1600 is asked for" in error
 
 
+def test_to_ask_for_what_is_automatic_is_to_ask_for_what_was_chosen(scene, finished, capsys):
+    words = ["train", scene, "--out", str(finished), "--set"]
+    assert main([*words, "train.view_opacity=auto"]) == 0
+    assert "is finished (60 steps)" in capsys.readouterr().out
+    for other in ("train.view_opacity=off", "train.refine_at=0,0"):  # refine_at was given
+        assert f"{other.partition('=')[0]} is " in failure(*words, other)
+
+
 def measured_psnr(out):
     assert main(["eval", str(out)]) == 0
     return json.loads((out / "eval" / "metrics.json").read_text())["mean"]["psnr"]

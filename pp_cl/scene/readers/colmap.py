@@ -210,6 +210,11 @@ def _image_file(folder, near, model, lenses, image):
 # The model ----------------------------------------------------------------------------------------
 
 
+def _check_number(file, records):
+    if len(records) > MOST_RECORDS:
+        raise UserError(f"{file}: holds more than {MOST_RECORDS} records; split the model")
+
+
 def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     """({id: camera, or the error about it}, images) of a folder's model. Raises UserError naming
     the file and the line or place in it.
@@ -230,6 +235,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
             text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
             lens = Unusable(f"{where}: {model} must have {text}", BROKEN_CAMERA)
         lenses[identity] = lens
+        _check_number(file, lenses)
     images: dict[PurePosixPath, Image] = {}
     file = folder / f"images{suffix}"
     for where, image in _records(file, _binary_image, IMAGE, _text_image):
@@ -241,8 +247,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         if images.get(name, image)[1:] != image[1:]:
             raise UserError(f"{file}: {image.name}: is listed twice; remove one")
         images[name] = image
-        if len(images) > MOST_RECORDS:
-            raise UserError(f"{file}: holds more than {MOST_RECORDS} records; split the model")
+        _check_number(file, images)
     if not images:
         raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
     return lenses, list(images.values())

@@ -259,6 +259,13 @@ def test_panoramas_are_no_unknown_lens(text):
     refused(text, "EQUIRECTANGULAR is panoramic")
 
 
+def test_more_cameras_than_a_model_has(text, monkeypatch):
+    monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_RECORDS", 10)
+    cameras = [f"{i + 1} PINHOLE 30 22 20 20 15 11" for i in range(11)]
+    edit(text, "cameras.txt", lambda lines: cameras)
+    refused(text, "cameras.txt: holds more than 10 records")
+
+
 def test_more_records_or_letters_than_a_model_has(written, monkeypatch):
     folder, _ = written
     monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_RECORDS", 10)
