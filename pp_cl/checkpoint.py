@@ -31,7 +31,8 @@ REQUIRED: dict[str, tuple] = dict.fromkeys(("step", "initial_points", "format"),
 REQUIRED |= dict.fromkeys(("views", "depth_range"), (list,))
 REQUIRED |= {"finished": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
 OPTIONAL: dict[str, tuple] = {"extended_from": (int,), "left_out": (list,), "notes": (list,)}
-OPTIONAL |= {"specular": (bool,), "exposed": (str, bool)}  # exposed is true in runs of 0.3.0
+OPTIONAL |= {"specular": (bool,), "averaged": (bool,)}
+OPTIONAL |= {"exposed": (str, bool)}  # true in runs of 0.3.0
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
 Arrays = Mapping[str, np.ndarray | DeviceRows]
@@ -226,7 +227,8 @@ def _problem_of_forms(stored, config):
         # gains are stored until the training decides that it needs none
         if "exposed" in header or step < decided_at(header.get("extended_from", 0), views):
             gains = views
-    table = stored_table(config, n, step, gains, has_specular="specular" in header)
+    averaged = header.get("averaged")
+    table = stored_table(config, n, step, gains, averaged, has_specular="specular" in header)
     expected = {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}
     for name in sorted(expected.keys() | forms.keys()):
         form, wanted = forms.get(name), expected.get(name)

@@ -305,6 +305,7 @@ def run_config(
     # the training was stopped before its first checkpoint: automatic settings are chosen again
     for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")
+    stored.automatic = []
     if "train.iterations" in [key for key, _, _ in given]:
         stored.train.minutes = 0.0
     return configure(stored, scene, given)

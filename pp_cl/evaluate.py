@@ -88,6 +88,6 @@ def evaluate_run(
         "published": published,
         "published_differs": differs,
     }
-    write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
+    write_json(target / "metrics.json", result)  # last: `make` takes the picture to be there, too
     return result

@@ -38,6 +38,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     size, (H, W, 3), or (H, W, 4) with straight alpha, which WebM keeps. An odd side is extended by
     its last row or column. Raises UserError naming the file if it cannot be written.
     """
+    path = path.resolve()  # ffmpeg takes 12:30.mp4 for an address
     frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames)
     looped = path.suffix.lower()[1:] in LOOPED
     with atomic_path(path) as temporary:

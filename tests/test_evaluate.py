@@ -1,5 +1,6 @@
 import json
 import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -44,6 +45,13 @@ def test_the_files_hold_what_was_measured_and_shown(run, capsys):
     assert main(["eval", str(run)]) == 0
     again = json.loads((run / "eval" / "metrics.json").read_text())
     assert again["per_image"] == result["per_image"]
+
+
+def test_figures_are_written_after_their_picture(run, tmp_path, monkeypatch):
+    """If it is stopped in between, `make` evaluates again."""
+    monkeypatch.setattr("pp_cl.evaluate.write_comparison", Mock(side_effect=KeyboardInterrupt))
+    assert main(["eval", str(run), "--out", str(tmp_path / "eval")]) == 130
+    assert not (tmp_path / "eval/metrics.json").exists()
 
 
 def test_what_an_earlier_evaluation_left_goes_with_the_next(run):

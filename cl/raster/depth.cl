@@ -48,7 +48,7 @@ kernel void depth_forward(
     }
     const bool stopped = end < pixel_offset[q + 1] && alpha > 0.0f;
     pixel_alpha[q] = alpha > 1.0f || stopped ? 1.0f : alpha;  // fmin() would hide a NaN
-    const float none = alpha == 0.0f ? INFINITY : alpha;      // a NaN stays one
+    const float none = alpha <= 0.0f ? INFINITY : alpha;      // a NaN stays one
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : none;
     pixel_median[q] = alpha > 0.0f ? median : none;
 }

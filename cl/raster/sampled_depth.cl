@@ -76,7 +76,7 @@ kernel void sampled_depth(
         }
         is_stopped = T < early_stop;
     }
-    const ints is_empty = alpha == 0.0f;
+    const ints is_empty = alpha <= 0.0f;  // a rounding below 0 at the very rim; a NaN stays one
     pixel_depth[q] = mean_of_nearest(select(depth / alpha, none, is_empty), voxel_size);
     pixel_median[q] = mean_of_nearest(select(median, none, is_empty), voxel_size);
     alpha = select(alpha, (floats)(1.0f), is_stopped | (alpha > 1.0f));

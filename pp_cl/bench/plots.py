@@ -33,7 +33,7 @@ def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)  # $ in names
     axes = figure.add_subplot(xscale="log", yscale="log")
     axes.set(xlabel="milliseconds", ylabel="error against float64")
     series: dict[str, list[dict]] = {}
@@ -62,7 +62,7 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
 
     ink = rcParams["text.color"]
     figure = Figure(figsize=(13, 7), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)  # $ in names
     left, right = figure.subplots(1, 2)
     left.set(ylabel="mean error against the exact rendering (colours in 0 to 1)", yscale="log")
     right.set(ylabel="PSNR against the photographs, dB")

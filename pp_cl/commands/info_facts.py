@@ -79,6 +79,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     of_point = sum(math.prod(form.shape[1:]) * form.dtype.itemsize for form in points)
     whole, size = math.prod(grid["dims"]), folder.checkpoint.stat().st_size
     refined = sum(at <= header["step"] for at in refine_steps(config.train))
+    if "extended_from" in header:  # all refinements came before
+        refined = sum(0 < share < 1 for share in config.train.refine_at)
     cameras = [image_file.camera.downscaled(config.scene.downscale) for image_file in image_files]
     return facts | {
         "step": header["step"],

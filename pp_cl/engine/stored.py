@@ -36,11 +36,14 @@ def stored_table(
     n: int,
     step: int | None,
     gains: int = 0,
+    averaged: bool | None = None,
     *,
     has_specular: bool = False,
 ) -> Table:
     """The arrays in a checkpoint with n points after `step` steps; None: of a finished training.
-    gains: number of views with gains. has_specular: whether the model has the specular layer.
+    gains: number of views with gains. averaged: whether averages have begun; None: as is due by the
+    steps in config, which a plan by minutes may have changed since. has_specular: whether the model
+    has the specular layer.
     """
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
@@ -55,7 +58,8 @@ def stored_table(
     if step is not None:
         table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
         state = PointState.table(n)
-        if config.train.ema and step >= ema_start(config.train.iterations):
+        is_due = config.train.ema and step >= ema_start(config.train.iterations)
+        if is_due if averaged is None else averaged:
             state |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
             table |= {f"average.{name}": row for name, row in network.items()}
         table |= {f"state.{name}": row for name, row in state.items()}
@@ -150,7 +154,7 @@ def restore_training(
 ) -> None:
     """Resume after `step` steps with a checkpoint's training state, which is removed from `arrays`;
     the model must be loaded already. A finished training stores no such state: its moments start
-    anew, and so does its EMA if it is due.
+    anew, and so do its EMA, if it is due, and the estimates of colours. exposed: Exposure.kind.
     """
     trainer.start_at(step, begun)
     train = trainer.config.train
@@ -159,8 +163,11 @@ def restore_training(
         if "exposure" not in arrays:
             trainer.exposure = None
         elif trainer.exposure:
-            trainer.exposure.restore(arrays.pop("exposure"), exposed)
-    elif train.ema and step >= ema_start(train.iterations):
+            trainer.exposure.restore(exposed, arrays.pop("exposure"))
+        return
+    if trainer.exposure:
+        trainer.exposure.restore(exposed)
+    if train.ema and step >= ema_start(train.iterations):
         trainer.optimiser.update_ema(1.0)
 
 

@@ -1,7 +1,7 @@
 """Reads and writes 8-bit image files."""
 
 import io
-import os
+import posixpath
 import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -226,9 +226,11 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def image_paths(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views with these names, without the folders all share."""
-    paths = [PurePosixPath(name) for name in names]
-    shared = os.path.commonpath([path.parent for path in paths])
+    """Relative paths of PNG files for views with these names, without the folders all share. None
+    leads out of the folder to which it is relative.
+    """
+    paths = [PurePosixPath(posixpath.normpath(f"/{name.lstrip('/')}")) for name in names]
+    shared = posixpath.commonpath([path.parent for path in paths])
     paths = [path.relative_to(shared) for path in paths]
     files = [path.with_suffix(".png") for path in paths]
     if len(set(files)) < len(files):  # such as a.jpg and a.png

@@ -130,12 +130,10 @@ def other_axes(cameras: Sequence[Camera], stated: Stated) -> str | None:
 def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None:
     """The reading in which a scene's cameras agree with its training views' masks, or None."""
     stated, small = find_reader(path).STATES, _small(evenly(views, TRIED_VIEWS))
-    splits = scene_splits(path)
-    files = [
-        image_file
-        for split in splits
-        for image_file in list_split(path, split, edited=False).image_files
-    ]
+    files: list[ImageFile] = []
+    for split in scene_splits(path):
+        with suppress(UserError):  # a training needs no other split than its own
+            files += list_split(path, split, edited=False).image_files
     forgiven = int(MOST_LEFT_OUT * len(small))
     as_stated = _beside(dev, small, forgiven)
     if as_stated < PERSISTING:

@@ -80,7 +80,7 @@ def first_hull(
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
     hull = build_grid(dev, views, points, box, forgiven)
-    if shares != UNSET:
+    if not _is_open(config):
         return hull, shares
     cameras = [view.camera for view in views]
     spacing = spacing_pixels(hull.grid, cameras)
@@ -90,7 +90,14 @@ def first_hull(
     first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
     if times and first != spacing:
         hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
-    return hull, REFINE_AT[times]
+    return hull, REFINE_AT[times] if shares == UNSET else shares
+
+
+def _is_open(config):
+    """Whether refinements decide how far apart points are at first; also in a run's further
+    members, which have the refinements of the first.
+    """
+    return config.train.refine_at == UNSET or "train.refine_at" in config.automatic
 
 
 class FittingHull(NamedTuple):
@@ -135,7 +142,7 @@ def fitting_hull(
             memory_plan.follow(plan.settings(config))
             given_up.append(f"features: of one sample a pixel in the end ({fault[0]})")
             fault = memory_plan.fault_of(*of_hull)
-        can_be_fewer = config.train.refine_at == UNSET and len(hull.ids) < last
+        can_be_fewer = _is_open(config) and len(hull.ids) < last
         fewer = memory_plan.coarser_points(*of_hull) if fault and can_be_fewer else 0
         if not (fault and fewer):
             memory_plan.check_points(*of_hull)

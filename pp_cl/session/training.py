@@ -252,6 +252,7 @@ class Training:
             model_header(trainer.model) | self.info | {"step": trainer.step, "finished": finished}
         )
         header |= {"exposed": trainer.exposed} if trainer.exposed else {}
+        header |= {} if finished else {"averaged": bool(trainer.optimiser.averages)}
         arrays = model_arrays(trainer.model) if finished else training_arrays(trainer)
         save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
@@ -414,7 +415,7 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
 
 def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Config]]:
     """Yield the run in a folder, then its further members. Each of these has the plan that the
-    first has by then, and the next seed.
+    first has by then, and the next seed. An unfinished one comes twice: it ends with its own plan.
     """
     yield folder, config
     if config.train.members > 1:
@@ -422,7 +423,14 @@ def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Conf
     for i in range(1, config.train.members):
         seed = (config.train.seed + i) % 2**32
         train = replace(config.train, seed=seed, members=1, minutes=0.0)
-        yield folder.member(i + 1), replace(config, train=train)
+        member = folder.member(i + 1)
+        if member.checkpoint.exists():
+            begun = configure(load_config(member.config), config.scene.path)
+            with opened_run(member, begun) as run:
+                finished = run.header["finished"]
+            if not finished:
+                yield member, begun
+        yield member, replace(config, train=train)
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:

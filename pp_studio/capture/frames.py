@@ -3,6 +3,7 @@ without blurred, broken and repeated ones; later removes their lens distortion.
 """
 
 import logging
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -126,7 +127,7 @@ def _photographs(folder, images):
             name += "_"
         taken.add(name.lower())
         targets.append(images / name)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(_threads(max(map(_pixels, files)))) as pool:
         made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
         yield from track(made, "frames", "image", len(files))
     for file in listed(folder, RAW):
@@ -153,6 +154,20 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
         return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
 
     return sorted(paths, key=natural)
+
+
+def _pixels(file):
+    """The pixels of an image, by its header; 1 if it cannot be read."""
+    try:
+        with opened_regular(file) as opened:
+            return math.prod(Image.open(opened, formats=FORMATS).size)
+    except Exception:  # decoders raise all kinds of exceptions on broken bytes
+        return 1
+
+
+def _threads(most):
+    """How many images of at most these pixels are decoded at once."""
+    return max(1, min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most)))
 
 
 def _take(folder, file, target):
@@ -367,8 +382,7 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
                 Image.fromarray(image[..., :3]).save(file, "JPEG", **QUALITY)
 
     most = max(image_file.camera.width * image_file.camera.height for image_file in image_files)
-    threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
-    with ThreadPoolExecutor(max(1, threads)) as pool:
+    with ThreadPoolExecutor(_threads(most)) as pool:
         made = pool.map(write, unwritten)
         list(track(made, "images", "image", len(unwritten)))
     return len(unwritten)

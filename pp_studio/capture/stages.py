@@ -243,9 +243,9 @@ class Capture:
     def _frames(self):
         facts = frames.take_images(self.source, self.frames)
         names = [image["name"] for image in evenly(facts["images"], masks.SHOWN_VIEWS)]
-        shown = [read_rgba(self.frames / name) for name in names]
+        whole = (read_rgba(self.frames / name) for name in names)
         shown = [
-            shrink(image, fitting_downscale(image.shape[:2], masks.SHOWN_SIZE)) for image in shown
+            shrink(image, fitting_downscale(image.shape[:2], masks.SHOWN_SIZE)) for image in whole
         ]
         write_png(self._file("frames", ".png"), contact_sheet(shown, names))
         left_out = [f"{image['source']} {image['reason']}" for image in facts["left_out"]]

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import itertools
 import os
 import shlex
 import time
@@ -141,7 +142,10 @@ def run(options: argparse.Namespace) -> None:
             scene = str(out / "scene")
             if not Path(scene, "transforms.json").exists():
                 clock.tell_of_capture(options.source)
+            written = _written(scene)
             step("capture", options.source, "--out", scene, *_hints(options))
+            if folder.checkpoint.exists() and _written(scene) != written:
+                print(f"the scene has changed; {_set_aside(folder)} is its model", flush=True)
             *stages, _ = STAGES  # the last one prints what it has written
             records = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
             summaries = [f"{name}: {record['line']}" for name, record in records.items()]
@@ -152,7 +156,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"wrote {page}: open it in a browser; it grows by itself", flush=True)
             if not (out / MODEL).exists() and _wrote_hull(out, scene, clock.title, options, masks):
                 show("So far this is the object's outline in the colours of the photographs.")
-        if not folder.config.exists():
+        if not folder.config.exists() or (options.preset and not folder.checkpoint.exists()):
             minutes = clock.training()
             preset = ["--preset", options.preset or _preset(minutes, share)]
             train(*preset, *smooth, "--minutes", f"{minutes:.3g}")
@@ -164,7 +168,7 @@ def run(options: argparse.Namespace) -> None:
             wanted = options.preset or _preset(in_all, share)
             if config["scene"]["downscale"] > 1 and wanted in _larger(config["preset"]):
                 # in more steps on images as small, it would only learn its photographs by heart
-                kept = folder.path.rename(out / f"run-of-{end['step']}-steps")
+                kept = _set_aside(folder)
                 print(f"the preset is {wanted} now; {kept} is the model so far", flush=True)
                 # an open page keeps that model, which is better than the new one's first previews
                 words = ["--preset", wanted, *smooth, "--minutes", f"{minutes:.3g}"]
@@ -260,6 +264,7 @@ class _Clock:
         passed = self.passed
         minutes_left = max(self.minutes - passed, LEAST_LEFT * self.minutes)
         self._planned, self._until = self.minutes, passed + minutes_left
+        self._iterations = None
         return self._divided(minutes_left)
 
     def _divided(self, minutes):
@@ -283,6 +288,7 @@ class _Clock:
         if self._planned >= self.minutes or minutes_left < LEAST_MORE or len(folder.rows()) < 2:
             return 0.0
         self._planned, self._until = self.minutes, self.minutes
+        self._iterations = None
         self.keep()
         return self._divided(minutes_left)
 
@@ -290,7 +296,7 @@ class _Clock:
         """The arguments of a finished training that goes on for these minutes."""
         rows = folder.rows()
         end = rows.pop()  # the training's last step is in the row before
-        late = next(row for row in rows if row["step"] >= LATE * end["step"])
+        late = next((row for row in rows if row["step"] >= LATE * end["step"]), rows[0])
         took, last = rows[-1]["seconds"] - late["seconds"], rows[-1]
         seconds = took / max(last["step"] - late["step"], 1) or last["seconds"] / last["step"]
         ending = end["seconds"] - last["seconds"]
@@ -332,6 +338,22 @@ def _preset(minutes, share):
             flush=True,
         )
     return chosen
+
+
+def _written(scene):
+    """When a capture wrote a scene; None if there is none."""
+    file = Path(scene, "transforms.json")
+    return file.stat().st_mtime_ns if file.exists() else None
+
+
+def _set_aside(folder):
+    """Rename a run, so that another takes its place; return its new path."""
+    steps = max((row["step"] for row in folder.rows()), default=0)
+    kept = folder.path.with_name(f"run-of-{steps}-steps")
+    for number in itertools.count(2):
+        if not kept.exists():
+            return folder.path.rename(kept)
+        kept = folder.path.with_name(f"run-of-{steps}-steps-{number}")
 
 
 def _larger(preset):

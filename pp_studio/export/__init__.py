@@ -22,7 +22,7 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         "the same in a tenth of the bytes, for Scaniverse, Spark, PlayCanvas and Babylon.js",
     ),
     "splat-glb": ("splat.glb", (".glb",), "the same as glTF (KHR_gaussian_splatting)"),
-    "ply": ("cloud.ply", (".ply",), "the visible points with colour and everything learned"),
+    "ply": ("cloud.ply", (".ply",), "the visible points with colour, opacity, radius and SH"),
     "glb": ("cloud.glb", (".glb",), "the coloured points"),
     "mesh": (
         "mesh.ply",

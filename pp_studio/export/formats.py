@@ -42,7 +42,7 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     check_file(path) if suffixes else check_new_folder(path)
     if out is None and suffixes:
         check_ours([path], "move it away, or choose another --out")
-    if name == "textured" and path.suffix.lower() == ".obj" and not path.exists():
+    if name == "textured" and path.suffix.lower() == ".obj" and not texture.is_textured(path):
         check_ours(texture.companions(path), "move it away, or choose another --out")
     if out is not None and not path.parent.is_dir():
         raise UserError(f"--out {path}: {path.parent} is no folder; make it first")

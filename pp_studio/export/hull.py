@@ -48,6 +48,8 @@ def hull_gaussians(
     # empty cells around the hull, so that the surface is closed
     room = 3
     field = gaussian_filter(np.pad(inside, room), SMOOTHING)
+    if field.max() <= 0.5:  # too thin for its voxels
+        return None
     places, _, normals, _ = marching_cubes(field, 0.5)
     size = hull.grid.voxel_size
     positions = (places - room) * size + np.asarray(hull.grid.origin)

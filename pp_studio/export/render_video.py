@@ -144,7 +144,7 @@ def render_video(
     rendered = render_frames(run, cameras, folder, style, minutes=minutes, anew=True)
     channels = 4 if style.background is None else 3
     write_video(video, (read_rgba(path)[..., :channels] for path in rendered.paths), fps)
-    remove_ours(folder.iterdir())
+    _remove_frames(folder)
     if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)
     return rendered
@@ -200,9 +200,14 @@ def _begin(folder, paths, identity, anew):
                 " or delete it"
             )
         check_ours([*paths, folder / IDENTITY])
-        remove_ours(folder.iterdir())
+        _remove_frames(folder)
     own(folder)
     write_json(folder / IDENTITY, identity)
+
+
+def _remove_frames(folder):
+    """Remove the frames, and then what says of which model they are."""
+    remove_ours(sorted(folder.iterdir(), key=lambda path: path.name == IDENTITY))
 
 
 def _identity(run, cameras, style):

@@ -3,7 +3,6 @@ The page can be written at any time, shows what is there, and reloads itself unt
 """
 
 import html
-import json
 import shutil
 import time
 import warnings
@@ -16,7 +15,7 @@ import numpy as np
 from pp_cl import Camera, Run, Training
 from pp_cl.engine import Renderer
 from pp_cl.files import atomic_path, own, write_png, write_text
-from pp_cl.scene import scene_frames
+from pp_cl.scene import read_json, scene_frames
 from pp_studio.capture.overview import overview
 from pp_studio.export.gaussians import Gaussians, first_gaussians, fitted_gaussians
 from pp_studio.export.page import HERE, filled, page_text, still
@@ -73,13 +72,14 @@ def write_result(
         done = run.folder.checkpoint
         evaluation: dict[str, Any] = {}
         if is_newer(run.folder.metrics(split), done):
-            evaluation = json.loads(run.folder.metrics(split).read_text("utf-8"))
+            evaluation = read_json(run.folder.metrics(split))
             _copy(run.folder.evaluation(split) / "comparison.png", folder / VIEWS)
             whose = "that the training has not seen" if split != "train" else "of the training"
             text = f"Views {whose}: rendered, photographed, and four times their difference."
             views = f"<p>{text}</p>\n{_image(VIEWS, 'views beside their photographs')}"
         shown = {name for name in (video, SPLAT) if is_newer(folder / name, done)}
-        if not is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done):
+        is_made = is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done)
+        if not (is_made and (folder / STILL).exists()):
             write_png(folder / STILL, still(run))
             gaussians = (fitted_gaussians if SPLAT in shown else first_gaussians)(run)
             write_model(folder, gaussians, run.cameras("train"), title)

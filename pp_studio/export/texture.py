@@ -2,6 +2,7 @@
 renderings of its training views.
 """
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -213,11 +214,23 @@ def companions(path: Path) -> list[Path]:
     return [path.with_suffix(".mtl"), path.with_suffix(".png")]
 
 
+def is_textured(path: Path) -> bool:
+    """Whether an OBJ and its materials are there, as export_texture() writes them."""
+    materials, texture = companions(path)
+    with suppress(OSError, UnicodeDecodeError):
+        return path.exists() and materials.read_text("utf-8") == _materials(path, texture)
+    return False
+
+
+def _materials(path, texture):
+    return f"newmtl {path.stem}\nillum 0\nKd 1 1 1\nmap_Kd {texture.name}\n"
+
+
 def _write_obj(path, mesh):
     materials, texture = companions(path)
     image = mesh.visual.material.baseColorTexture
     write_png(texture, np.asarray(image) / np.float32(255))
-    write_text(materials, f"newmtl {path.stem}\nillum 0\nKd 1 1 1\nmap_Kd {texture.name}\n")
+    write_text(materials, _materials(path, texture))
     near = mesh.copy()
     near.visual.material = SimpleMaterial(image=image, name=path.stem)
     text, _ = export_obj(

@@ -23,7 +23,7 @@ from pp_cl.scene import frame_keys, up_of
 from pp_studio.camera_path import through
 from pp_studio.export.gaussians import CONSTANT, kept_gaussians
 from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
-from pp_studio.view.server import switches
+from pp_studio.view.server import plain, switches
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
@@ -251,7 +251,7 @@ class ModelPage:
         """Show the state of the run on the page, with a line below it."""
         step, steps = self.run.header["step"], self.run.config.train.iterations
         points = self.run.model.cloud.count
-        self._status.content = f"step {step} of {steps}, {points} points\n\n{line}"
+        self._status.content = f"step {step} of {steps}, {points} points\n\n{plain(line)}"
 
     def _camera(self, tab):
         """Camera of a rendering that fills a tab, in its pixels, or fewer if these are too many."""

@@ -11,7 +11,7 @@ from pp_cl import OnStep, RunFolder, Training, fastest, load
 from pp_cl.engine import Device
 from pp_cl.errors import UserError
 from pp_studio.view.model_page import ModelPage, announce
-from pp_studio.view.server import started
+from pp_studio.view.server import plain, started
 
 POLL = 1.0  # seconds between checks of checkpoint and log
 BREAK = 2.0  # a training runs undisturbed for this many times a rendering: it gets two thirds
@@ -58,9 +58,10 @@ class RunView:
             try:
                 self._take(load(self._folder.path, self._dev, scene=self._scene))
             except UserError as error:
-                self.told.content = str(error)
+                self.told.content = plain(str(error))
         elif self.page is None and not self._folder.checkpoint.exists():
-            self.told.content = f"{self._folder}: no checkpoint yet; waiting for the first one"
+            where = plain(str(self._folder))
+            self.told.content = f"{where}: no checkpoint yet; waiting for the first one"
             announce(self._server, "waiting for the first checkpoint")
         if self.page and self._is_new(self._folder.log):
             self.page.set_rows(logged(self._folder))
@@ -85,7 +86,7 @@ class RunView:
         try:
             views = run.scene("train").splits["train"]
         except UserError as error:
-            self.told.content = f"no photographs: {error}"
+            self.told.content = f"no photographs: {plain(str(error))}"
         announce(self._server, "building kernels, which takes a while the first time")
         self.page = ModelPage(self._server, run, views)
 

@@ -26,7 +26,7 @@ from pp_cl.scene import (
     up_of,
     write_edits,
 )
-from pp_studio.view.server import switches
+from pp_studio.view.server import plain, switches
 from pp_studio.view.space import CHOSEN, VIEW, Space, thumbnail
 
 SHOWN_POINTS = 20_000  # most points that a browser draws while it turns
@@ -151,7 +151,7 @@ class ScenePage:
         try:
             dropped, (box, is_given) = read_edits(self._folder).dropped, self._box()
         except UserError as error:
-            self._status.content = str(error)
+            self._status.content = plain(str(error))
             return
         low, high = self._space.page(box)
         colour, options = CHOSEN if is_given else SUGGESTED, {"opacity": 0.15, "side": "double"}
@@ -167,7 +167,7 @@ class ScenePage:
         self._drop.label = "Take back" if chosen in dropped else "Drop"
         count, views = len(self._frustums.keys() - dropped), len(self._frustums)
         state = "given" if is_given else "suggested"
-        self._status.content = f"{count} of {views} views, box {state}\n\n{line}"
+        self._status.content = f"{count} of {views} views, box {state}\n\n{plain(line)}"
 
     # ---- the slow work
 
@@ -186,7 +186,7 @@ class ScenePage:
             try:
                 points = hull_points(self._device, str(self._folder))
             except UserError as error:
-                self._status.content += f"\n\n{error}"
+                self._status.content += f"\n\n{plain(str(error))}"
             else:
                 self._add_points(points, np.full((len(points), 3), GREY, np.uint8))
 

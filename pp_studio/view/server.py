@@ -51,6 +51,11 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
             server.stop()
 
 
+def plain(text: str) -> str:
+    """Text of others, such as a file's name, for viser's Markdown, which renders HTML in it."""
+    return html.escape(text, quote=False).replace("[", r"\[")
+
+
 def switches(server: Any) -> Any:
     """A context in which anything added to server.gui goes into a panel of its own, beside that of
     the page's lines; on a phone, where it would cover the picture, it starts closed.

@@ -181,6 +181,8 @@ def test_to_8bit():
         (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
         (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
         (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
+        (["a.jpg", "../../../b.jpg"], ["a.png", "b.png"]),
+        (["/data/a.png", "b/c.png"], ["data/a.png", "b/c.png"]),
     ],
 )
 def test_every_image_has_a_file_of_its_own(names, files):

@@ -1,6 +1,7 @@
 """A run of several trainings shows the mean of their images."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -65,3 +66,23 @@ def test_it_resumes_in_either_member(scene, both, tmp_path, monkeypatch, capsys,
     capsys.readouterr()
     assert main(arguments(scene, out, **SETTINGS)) == 0
     assert capsys.readouterr().out.count("is finished") == 2
+
+
+def test_a_longer_run_ends_an_unfinished_member_before_it_extends_it(
+    scene, both, tmp_path, monkeypatch
+):
+    longer, train_step = SETTINGS | {"train__iterations": 30}, Trainer.train_step
+    whole, killed = (shutil.copytree(both, tmp_path / name) for name in ("whole", "killed"))
+    shutil.rmtree(killed / "member-2")
+
+    def stopping(trainer):
+        if (trainer.config.train.seed, trainer.step) == (1, 12):
+            raise KeyboardInterrupt
+        return train_step(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        assert main(arguments(scene, killed, **SETTINGS)) == 130
+    for out in (whole, killed):
+        assert main(arguments(scene, out, **longer)) == 0
+    assert checkpoint(killed / "member-2") == checkpoint(whole / "member-2")

@@ -38,6 +38,18 @@ def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong
     assert load_config(out / "config.json").train.view_opacity == opacity
 
 
+def test_a_further_member_begins_with_the_points_of_the_first(dev, tmp_path):
+    """Its plan has the refinements that the first has chosen, with the points that these need."""
+    scene, counts = write_ball_scene(tmp_path / "ball", views=8, size=128), []
+    given = [("points.count", 3000, "test"), ("scene.downscale", 1, "test")]
+    config = run_config(RunFolder(tmp_path / "a"), scene, "tiny", given)
+    for name in "ab":
+        training = open_training(dev, RunFolder(tmp_path / name), config, None)
+        counts.append(training.trainer.model.cloud.count)
+        config = Plan.given(training.config).settings(config)
+    assert counts[0] == counts[1] > 1.1 * 3000
+
+
 def test_settings_never_change(dev, tmp_path, scene):
     """A training records its decisions in a copy of the settings, which config.json holds."""
     folder, given = RunFolder(tmp_path / "run"), [("points.count", 500, "test")]

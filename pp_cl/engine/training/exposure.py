@@ -134,8 +134,9 @@ class Exposure:
         enough in the training to judge matrices, too.
         """
         by_gains, by_matrices, beyond = self.explained()
-        self.is_full = is_last and by_matrices > LEAST_FULL_SHARE and beyond > LEAST_BEYOND
-        if self.is_full:
+        if is_last:
+            self.is_full = by_matrices > LEAST_FULL_SHARE and beyond > LEAST_BEYOND
+        if is_last and self.is_full:
             reason = f"colour ({by_matrices:.0%} of their error); a matrix for each view is"
         elif not self.is_applied and by_gains > LEAST_SHARE:
             reason = (
@@ -155,10 +156,11 @@ class Exposure:
             return ""
         return MATRICES if self.is_full else GAINS
 
-    def restore(self, state: np.ndarray, kind: str) -> None:
-        """Continue from the state and the kind stored in a checkpoint."""
-        self.dev.write(self.state, state)
-        self.is_applied, self.is_full = kind != "", kind == MATRICES
+    def restore(self, kind: str, state: np.ndarray | None = None) -> None:
+        """Continue with a checkpoint's kind of correction; without its state, estimate it anew."""
+        if state is not None:
+            self.dev.write(self.state, state)
+        self.is_applied, self.is_full = self.is_applied or bool(kind), kind == MATRICES
 
 
 def _gains(sums):

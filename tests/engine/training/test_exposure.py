@@ -87,6 +87,8 @@ def test_matrices_are_found_and_a_training_goes_on_with_them(dev, tmp_path, monk
     assert main(["train", scene, "--out", str(run)]) == 0
     checkpoints = [folder / "checkpoint.npz" for folder in (whole, run)]
     assert checkpoints[0].read_bytes() == checkpoints[1].read_bytes()
+    assert main(["train", scene, "--out", str(run), "--iterations", str(STEPS + 5)]) == 0
+    assert load_checkpoint(checkpoints[1])[0]["exposed"] == "matrices"  # as the model learned
 
 
 def test_views_are_compared_without_and_with_their_colour(exposed, capsys):

@@ -4,6 +4,7 @@ import re
 import shutil
 import signal
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,12 +52,13 @@ def test_the_page_links_what_is_there(made):
 def test_the_same_command_does_only_what_is_left(made, capsys):
     scene, folder = made
     checkpoint = (folder / "run/checkpoint.npz").read_bytes()
-    (folder / "index.html").unlink()
+    for name in ("index.html", "thumbnail.png"):
+        (folder / name).unlink()
     made = [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
     assert main(["make", scene, "--out", str(folder)]) == 0
     assert "is finished" in capsys.readouterr().out
     assert made == [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
-    assert (folder / "index.html").exists()
+    assert (folder / "index.html").exists() and (folder / "thumbnail.png").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
 
 
@@ -156,6 +158,49 @@ def test_a_third_of_the_minutes_is_the_trainings(tmp_path, minutes, capsys):
         )
         assert clock.left == pytest.approx(5) and clock.told == "5.0 of 18 minutes left"
     assert make._Clock(tmp_path / "make.json", None, None).left == pytest.approx(5)
+
+
+def test_the_steps_of_an_extension_end_with_it(tmp_path):
+    """Also where the log has lost all rows but the first and the last two."""
+    seconds = {1: 1.0, 100: 50.0}
+    rows = [{"step": step, "seconds": time} for step, time in [*seconds.items(), (100, 52.0)]]
+    folder = SimpleNamespace(rows=lambda: [*rows])
+    with make._Clock(tmp_path / "make.json", 9, None) as clock:
+        assert clock.extended(folder, 1.0) == ["--iterations", "216"] == clock.iterations()
+        rows[:] = rows[:1] + rows[2:]
+        assert clock.extended(folder, 1.0)[0] == "--iterations"
+        clock.training()
+        assert clock.iterations() == []
+
+
+def test_a_scene_that_has_changed_is_trained_anew(tmp_path, monkeypatch):
+    """Its run is kept, twice under the same number of steps."""
+    out, trained = tmp_path / "out", []
+
+    def step(name, *arguments, **_):
+        if name == "capture":
+            for stage in STAGES:
+                write_json(out / f"scene/capture/{stage}.json", {"line": f"{stage} done"})
+            if "--masks" in arguments:
+                write_json(out / "scene/transforms.json", {})
+        if name == "train":
+            trained.append((arguments, (out / "run").exists()))
+            raise Enough
+
+    monkeypatch.setattr(make, "_step", step)
+    monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
+    (tmp_path / "photographs").mkdir()
+    for folder in ("scene/capture", "run-of-60-steps", "run"):
+        (out / folder).mkdir(parents=True)
+    write_json(out / "scene/transforms.json", {})
+    for name in ("config.json", "checkpoint.npz", "log.jsonl"):
+        (out / "run" / name).write_text(json.dumps({"step": 60, "seconds": 9}) + "\n")
+    own(out)
+    for hints in ([], ["--masks", "M"]):
+        with pytest.raises(Enough):
+            spoken(["make", tmp_path / "photographs", "--out", out, *hints])
+    assert [there for _, there in trained] == [True, False] and "--minutes" in trained[1][0]
+    assert (out / "run-of-60-steps-2/checkpoint.npz").exists()
 
 
 def test_a_preset_that_others_make_smaller_is_told(capsys):

@@ -86,6 +86,13 @@ def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     assert np.array_equal(*(np.asarray(image.convert("RGB")) for image in images))
     first = path.read_text().splitlines()[0]
     assert first.startswith("# seen_faces ") and "shown by no photograph" in first
+    assert check_target("textured", run.folder.path, path) == path
+    materials, _ = companions(path)
+    before = materials.read_text()
+    materials.write_text("newmtl mine\n")
+    with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
+        check_target("textured", run.folder.path, path)
+    materials.write_text(before)
     path.unlink()  # its companions may be a user's now
     with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
         check_target("textured", run.folder.path, path)

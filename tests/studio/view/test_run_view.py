@@ -203,11 +203,11 @@ def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copie
 
 def test_a_run_whose_images_are_gone_is_still_shown(served, dev, copied):
     config = json.loads((copied / "config.json").read_text())
-    config["scene"]["path"] = "/nowhere/at/all"
+    config["scene"]["path"] = "/nowhere/<i>[at]/all"
     (copied / "config.json").write_text(json.dumps(config))
     view = RunView(served[0], dev, RunFolder(copied))
     view.look()
-    assert "/nowhere/at/all" in view.told.content
+    assert r"/nowhere/&lt;i&gt;\[at]/all" in view.told.content  # neither HTML nor a link
     with looking(view, served[1]) as opened:
         drawn(view)
         assert (opened.image() < 200).any()
