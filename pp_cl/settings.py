@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-FORMAT = 3  # of config.json: goes up when keys are added, change meaning or are removed
+FORMAT = 3  # of config.json: goes up when keys change meaning or go; added ones: config.ADDED
 BLOCKS = ("double", "single", "gated")  # kinds of blocks at a level of the network
 
 

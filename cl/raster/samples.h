@@ -6,7 +6,7 @@
 #include "lanes.h"
 #include "raster/footprint.h"
 
-// The rays (x, y, 1) through the samples of a pixel, in camera axes; z: half of them.
+// The rays (x, y, 1) through the samples of a pixel, in camera axes.
 typedef struct {
     floats x, y;
     floats length2, per_length;

@@ -37,7 +37,7 @@ class PointState:
     @staticmethod
     def ema_table(n: int) -> Table:
         """The averages of n points: for all parameters but harmonics above degree 0, whose averages
-        would take most of the memory and gain 0.02 dB (docs/recipe.md).
+        would take most of the memory and gain 0.02 dB.
         """
         table = PointCloud.table(n, sh_blocks(0))
         del table["ids"]
