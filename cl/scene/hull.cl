@@ -3,7 +3,7 @@
 // b.
 #include "common.h"
 
-#define LEVEL 0x8000  // so that doubts do not borrow from the views that reject
+#define EVEN 0x8000  // so that doubts do not borrow from the views that reject
 
 // One work-item per word of a mask's row: reads the alpha of its 32 pixels, writes the set of those
 // above `threshold`.
@@ -69,10 +69,9 @@ kernel void carve(
     const uint word = get_global_id(0), row = get_global_id(1);
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
-    uint
-        tally[32];  // below bit 16 LEVEL and the views that see the vertex, above those that reject
+    uint tally[32];  // below bit 16 EVEN and the views that see the vertex, above those that reject
     for (uint b = 0; b < 32; b++)
-        tally[b] = LEVEL;
+        tally[b] = EVEN;
     uint alive = 1;
     for (uint view = 0; view < views && alive; view++) {
         const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
@@ -96,7 +95,7 @@ kernel void carve(
     }
     uint in_hull = 0;
     for (uint b = 0; b < 32; b++) {
-        const int seen = (int)(tally[b] & 0xffff) - LEVEL;
+        const int seen = (int)(tally[b] & 0xffff) - EVEN;
         const uint rejected = tally[b] >> 16;
         in_hull |= (uint)(seen >= (int)least && views * rejected <= forgiven * seen) << b;
     }
