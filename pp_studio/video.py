@@ -51,8 +51,10 @@ def _write_looped(path, frames, fps):
     unit = 10 if path.suffix.lower() == ".gif" else 1
     ends = [round(i * 1000 / fps / unit) for i in range(MOST_FRAMES + 1)]
     durations = [unit * (end - start) for start, end in pairwise(ends)]
-    options = {"save_all": True, "duration": durations, "loop": 0}
-    next(images).save(path, append_images=images, **options)
+    first, options = next(images), {"save_all": True, "duration": durations, "loop": 0}
+    if path.suffix.lower() == ".gif" and first.mode == "RGBA":
+        options["disposal"] = 2  # else earlier frames stay where this one is transparent
+    first.save(path, append_images=images, **options)
 
 
 def _write(path, frames, fps):

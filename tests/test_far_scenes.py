@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import plyfile
@@ -13,6 +14,7 @@ from pp_cl.cli import main
 from pp_cl.engine.raster.footprint import MOST_OF_GAUSSIANS
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.run import load
+from pp_studio.export.formats import export_run
 from pp_studio.export.gltf import write_glb
 from pp_studio.export.mesh import Mesh, write_mesh
 from pp_studio.export.points import coloured_points, in_world, write_ply
@@ -110,6 +112,14 @@ def test_exported_meshes_keep_their_places_in_the_world(suffix, tmp_path):
     if suffix == "ply":
         vertex = plyfile.PlyData.read(str(path))["vertex"]
         assert np.array_equal(np.stack([vertex[c] for c in ("red", "green", "blue")], 1), colours)
+
+
+def test_a_mesh_for_printers_is_moved_to_the_origin(far_run, tmp_path):
+    """STL holds float32."""
+    words = export_run(far_run, "mesh", tmp_path / "a.stl")
+    assert re.search("less (999999|1e06|100000[01]), -", words), words
+    vertices = trimesh.load(tmp_path / "a.stl").vertices
+    assert np.abs(vertices).max() < 5 and len(np.unique(vertices[:, 0])) > 20
 
 
 def test_files_keep_float32_where_it_holds_the_places():

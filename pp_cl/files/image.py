@@ -51,7 +51,11 @@ def read_rgba(
         if turned or (size is not None and size == image.size[::-1] != image.size):
             ImageOps.exif_transpose(image, in_place=True)
         srgb = in_srgb(path, image)
-        return np.array(srgb if srgb.mode == "RGBA" else srgb.convert("RGBA"))
+        rgba = np.array(srgb if srgb.mode == "RGBA" else srgb.convert("RGBA"))
+        if image.format == "TIFF" and size == rgba.shape[:2] != rgba.shape[1::-1]:
+            reason = "its orientation turns it, but its camera is that of the stored pixels"
+            raise Unusable(f"{path}: {reason}; write it upright", UNREADABLE)
+        return rgba
 
 
 def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
@@ -144,14 +148,14 @@ def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> t
 
 
 def exif_turns(path: Path | str) -> int:
-    """The quarter turns clockwise by which a picture's EXIF says to show it; 0 without EXIF. Raises
-    Unusable as read_rgba() does.
+    """The quarter turns clockwise by which a picture's EXIF says to show it; 0 without EXIF, and
+    for TIFF, which Pillow turns itself. Raises Unusable as read_rgba() does.
     """
     if Path(path).suffix.lower() == ".exr":
         return 0
     with _opened(path, checked=False) as image:
         # getexif() would decode a PNG without EXIF
-        has_exif = image.format != "PNG" or "exif" in image.info
+        has_exif = "exif" in image.info if image.format == "PNG" else image.format != "TIFF"
         return QUARTERS.get(image.getexif().get(ORIENTATION), 0) if has_exif else 0
 
 

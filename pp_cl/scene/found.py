@@ -102,7 +102,8 @@ def pictures_of(files: Sequence[Path]) -> list[object]:
     """A key for each file that only copies of the same picture share: its path, or its digest if
     another file has the same size.
     """
-    sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
+    readable = [os.path.isfile(file) and os.access(file, os.R_OK) for file in files]
+    sizes = [os.path.getsize(f) if ok else -1 for f, ok in zip(files, readable, strict=True)]
     often = Counter(sizes)
     return [
         sha256_of(file).digest() if size >= 0 and often[size] > 1 else file

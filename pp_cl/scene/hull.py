@@ -269,7 +269,9 @@ def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
 
 def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: the pixels that points with ids (N,) cover, with gaps between them closed."""
-    gap = math.ceil(spacing_pixels(grid, [camera])) + 1
+    # bounded for a camera among the points
+    spacing = min(spacing_pixels(grid, [camera]), max(camera.width, camera.height) / 4)
+    gap = math.ceil(spacing) + 1
     wide = camera.crop(-gap, -gap, camera.width + 2 * gap, camera.height + 2 * gap)
     column, row, is_shown = wide.pixels(grid.positions(ids))
     marked = np.zeros((wide.height, wide.width), bool)
@@ -393,7 +395,8 @@ def _farthest_point_order(views, centre):
     vertices.
     """
     directions = np.stack([view.camera.eye - centre for view in views])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= np.where(lengths > 0, lengths, 1)  # an eye may be at the centre
     order, nearest = [], np.full(len(views), np.inf)
     for _ in views:
         order.append(int(np.argmax(nearest)))

@@ -1,6 +1,7 @@
 """Models of lens distortion, and the removal of distortion from images."""
 
 from dataclasses import astuple, dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from pp_cl.engine.device.device import Device
 
 PROBED = 65  # places along each axis at which a lens is tested for folds
 BAND_BYTES = 2**23  # bytes of the spline's coefficients on the device at a time
+ON_DEVICE = Lock()  # a kernel keeps the arguments of one launch, and threads read images
 MARGIN = 8  # coefficients beyond the image's left and right border, as in cl/scene/lens.cl
 # extra rows around those that are read, over which the recursion forgets its start (to 3e-7)
 RUN_UP = 12
@@ -67,8 +69,14 @@ def undistort(
 ) -> np.ndarray:
     """(H // factor, W // factor, 4) uint8 straight RGBA: the image (H, W, 4) as the camera would
     have taken it without distortion. Pixels are means of factor x factor samples of a cubic spline
-    through the premultiplied colours; beyond the image's border its edge is repeated.
+    through the premultiplied colours; beyond the image's border its edge is repeated. Threads wait
+    for each other.
     """
+    with ON_DEVICE:
+        return _undistorted(dev, image, camera, lens, factor)
+
+
+def _undistorted(dev, image, camera, lens, factor):
     width, height = camera.width // factor, camera.height // factor
     program, columns = dev.program("scene/lens"), camera.width + 2 * MARGIN
     packed = [camera.fx, camera.fy, camera.cx, camera.cy, *astuple(lens)]

@@ -208,7 +208,7 @@ def _right_handed(folder, image_files, left_out, done):
     Images whose handedness differs from most go to left_out.
     """
     is_left = [np.linalg.det(image.camera.pose[:, :3]) < 0 for image in image_files]
-    are_most, kept = 2 * sum(is_left) >= len(is_left), []
+    are_most, kept = 2 * sum(is_left) > len(is_left), []
     for image, is_mirrored in zip(image_files, is_left, strict=True):
         if is_mirrored != are_most:
             text = (

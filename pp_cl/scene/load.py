@@ -184,7 +184,10 @@ def _as_masks_fit(folder, image_files):
             is_square = file.camera.width == file.camera.height
             asked += [file] if turns == 2 or (turns and is_square) else []
     fits = []
-    for file in evenly([file for file in asked if file.mask], MEASURED):
+    masked = [file for file in asked if file.mask]
+    for file in evenly(masked, MEASURED):
+        if min(file.camera.width, file.camera.height) < 2:
+            continue  # has no gradient
         with suppress(UserError):
             image, turned = (
                 read_rgba(folder / file.name, turned=is_turned) for is_turned in (False, True)

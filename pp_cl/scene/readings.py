@@ -88,7 +88,7 @@ def read_as(
         "next": (counted, counted[1:] + counted[:1]),
         "previous": (counted, counted[-1:] + counted[:-1]),
     }
-    for word in {*words} & {*ORDERS}:
+    for word in filter(orders.get, dict.fromkeys(words)):
         pose = {i: cameras[j].pose for i, j in zip(*orders[word], strict=True)}
         cameras = [replace(camera, pose=pose[i]) for i, camera in enumerate(cameras)]
     return [

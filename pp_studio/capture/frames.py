@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -366,14 +365,12 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
         for image_file in image_files
         if not (images / Path(image_file.name).name).is_file()
     ]
-    lock = Lock()  # only one thread at a time uses the device
 
     def write(image_file):
         name = Path(image_file.name).name
         image = read_rgba(frames / name)
         if image_file.lens:
-            with lock:
-                image = undistort(dev, image, image_file.camera, image_file.lens)
+            image = undistort(dev, image, image_file.camera, image_file.lens)
         if name.endswith(".png"):
             is_opaque = (image[..., 3] == 255).all()
             write_png(images / name, image[..., :3] if is_opaque else image)

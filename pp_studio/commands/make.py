@@ -78,7 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the steps that are not done yet, and say what to open."""
     from pp_cl import RunFolder, load
+    from pp_cl.files import write_json
     from pp_cl.scene import read_json, scene_splits
+    from pp_studio.export import length
     from pp_studio.export.gaussians import fitted_gaussians
     from pp_studio.export.result import (
         INDEX,
@@ -173,6 +175,8 @@ def run(options: argparse.Namespace) -> None:
                 # an open page keeps that model, which is better than the new one's first previews
                 words = ["--preset", wanted, *smooth, "--minutes", f"{minutes:.3g}"]
                 train(*words, follow=None)
+                if (known := kept / length.FILE).exists():  # the scene and its unit are the same
+                    write_json(folder.path / length.FILE, read_json(known))
             else:
                 train(*clock.extended(folder, minutes))
         split = "test" if "test" in scene_splits(scene) else "train"

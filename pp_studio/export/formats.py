@@ -87,9 +87,13 @@ def export_run(
     write: Callable[[], None]
     if name == "mesh":
         made = mesh.coloured_mesh(run, within)
-        write = partial(mesh.write_mesh, path, replace(made, vertices=placed(made.vertices)))
+        vertices, origin = placed(made.vertices), np.zeros(3)
+        if path.suffix.lower() == ".stl" and vertices.dtype == np.float64:  # STL holds float32
+            origin = np.rint(vertices.mean(0))
+        write = partial(mesh.write_mesh, path, replace(made, vertices=vertices - origin))
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        words = f"{len(made.vertices)} vertices, {_faces(len(made.faces), made.seen)}{unlit}{unit}"
+        words = f"{len(vertices)} vertices, {_faces(len(made.faces), made.seen)}{unlit}{unit}"
+        words += _less(origin)
     elif name == "textured":
         solid = texture.textured_mesh(run, turn, within)
         solid.apply_scale(metres)
@@ -118,8 +122,7 @@ def export_run(
         else:
             kind = splat.write_splat_ply if name == "splat" else splat.write_splat_spz
             write = partial(kind, path, table)
-            if origin.any():
-                words += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
+            words += _less(metres * origin)
     else:
         kept = points.coloured_points(run, min_weight, within)
         radius = np.float32(metres) * kept.radius
@@ -135,6 +138,11 @@ def export_run(
         own(path.parent)
     write()
     return words
+
+
+def _less(origin):
+    """What is subtracted from positions, in words; "" for 0."""
+    return f", less {', '.join(f'{x:.9g}' for x in origin)}" if origin.any() else ""
 
 
 def _faces(count, shown):

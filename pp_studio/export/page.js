@@ -325,7 +325,13 @@ function fade() {
 
 const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
 if (!gl) hint.textContent = "This page needs WebGL2, which this browser or device does not have.";
-const draw = gl && makeDrawer(gl);
+let draw = gl && makeDrawer(gl);
+// a phone may take the context away while the page is not seen; unless this is told, it stays lost
+canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+canvas.addEventListener("webglcontextrestored", () => {
+  draw = makeDrawer(gl);
+  show();
+});
 const FAST = 20, SLOW = 40, COARSEST = 0.4, REST = 200;  // milliseconds, but for COARSEST
 let look = lookOf(location.hash), waiting = false, rests = 0;
 let order = null, wanted = null, sortedAxis = "";  // of the last sort; the next axis, and this one
@@ -443,8 +449,10 @@ function move(dx, dy) {
   look.target = add(look.target, shift);
 }
 
+// Never nearer than the Gaussians that are drawn: at the target itself, there is no direction.
 function approach(factor) {
-  look.eye = add(look.target, add(look.eye, look.target, -1), factor);
+  const offset = add(look.eye, look.target, -1), least = header.nearest / Math.hypot(...offset);
+  look.eye = add(look.target, offset, Math.max(factor, Math.min(1, least)));
 }
 
 // A finger within another page may be about to scroll that, which a browser tells after some pixels.
@@ -495,10 +503,12 @@ const back = () => { look = { ...first }; soon(); };
 canvas.addEventListener("dblclick", back);
 const STEPS = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;  // the browser's own
   if (STEPS[event.key]) turn(...STEPS[event.key]);
   else if (event.key === "+" || event.key === "-") approach(event.key === "+" ? 0.9 : 1 / 0.9);
   else if (event.key === "r" || event.key === "R") back();
   else return;
+  event.preventDefault();  // a page around this one would scroll
   soon();
 });
 addEventListener("hashchange", () => { look = lookOf(location.hash); soon(); });

@@ -27,7 +27,7 @@ from pp_cl.files import (
     write_json,
     write_png,
 )
-from pp_studio.export.gaussians import drawn_by, kept_gaussians, window_camera
+from pp_studio.export.gaussians import FILE, drawn_by, kept_gaussians, window_camera
 from pp_studio.large import MOST_PARTS, fineness, parts, render_large
 from pp_studio.video import write_video
 
@@ -212,11 +212,16 @@ def _remove_frames(folder):
 
 def _identity(run, cameras, style):
     """A digest of everything on which the frames depend, and their count."""
-    checkpoint, model = run.folder.checkpoint.stat(), run.model
+    model = run.model
     varied = run.renderer.supersampling, model.cloud.count, bool(model.specular), len(run.others)
     about = style, run.header["step"], run.config.raster, varied
     digest = hashlib.sha256(repr(about).encode())
-    digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
+    files = [run.folder.checkpoint]
+    if style.parts == GAUSSIANS:  # another fit may take their place
+        files += [file for file in [run.folder.path / FILE] if file.exists()]
+    for file in files:
+        stat = file.stat()
+        digest.update(f"{stat.st_size} {stat.st_mtime_ns}".encode())
     for camera in cameras:
         digest.update(run.model.packed(camera).tobytes())
     return {"frames": digest.hexdigest(), "count": len(cameras)}

@@ -13,7 +13,8 @@ addEventListener("message", ({ source, data }) => {
   if (String(data).startsWith("#")) history.replaceState(null, "", data);
 });
 window.ppclVersion = (newest) => {
-  if (newest !== version && !isHeld) location.reload();
+  // not for an older one, which a folder that is being copied may have for a while; the last is ""
+  if ((!newest || newest > version) && !isHeld) location.reload();
 };
 if (version) setInterval(() => {
   const script = document.createElement("script");

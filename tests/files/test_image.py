@@ -10,6 +10,8 @@ from support.refused import refusing
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import (
+    ORIENTATION,
+    exif_turns,
     image_paths,
     image_size,
     read_mask,
@@ -165,6 +167,20 @@ def test_written_image_comes_back(tmp_path, rng, shape):
     assert np.array_equal(stored, to_8bit(image))
     write_png(tmp_path / "bytes.png", stored)
     assert np.array_equal(stored, np.array(Image.open(tmp_path / "bytes.png")))
+
+
+@pytest.mark.parametrize("orientation, size", [(3, (7, 5)), (6, (5, 7))])
+def test_a_tiff_is_shown_as_pillow_turns_it(tmp_path, rgba, orientation, size):
+    """A camera of the stored pixels of a picture on its side is refused."""
+    path, exif = tmp_path / "a.tif", Image.Exif()
+    exif[ORIENTATION] = orientation
+    Image.fromarray(rgba[..., :3]).save(path, exif=exif)
+    assert exif_turns(path) == 0 and image_size(path) == size
+    turned = np.rot90(rgba[..., :3], 2 if orientation == 3 else -1)
+    np.testing.assert_array_equal(read_rgba(path, size)[..., :3], turned)
+    if orientation == 6:
+        with pytest.raises(Unusable, match="its orientation turns it"):
+            read_rgba(path, size[::-1])
 
 
 def test_to_8bit():

@@ -210,6 +210,13 @@ def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
 
 
 @pytest.mark.large
+def test_an_eye_in_the_middle_hides_no_view():
+    views = ball_views()
+    views[2] = replace(views[2], stored_camera=replace(views[2].stored_camera, pose=np.eye(3, 4)))
+    order = hull._farthest_point_order(views, np.zeros(3))
+    assert sorted(map(id, order)) == sorted(map(id, views))
+
+
 def test_without_masks_a_box_that_is_stated_is_filled(dev):
     views = [replace(view, image=np.full_like(view.image, 255)) for view in ball_views()]
     box = np.stack([CENTRE - 0.5, CENTRE + 0.5])

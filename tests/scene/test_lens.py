@@ -1,4 +1,7 @@
 import json
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ from support.transforms_scenes import refused, write_scene
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
+from pp_cl.scene import lens
 from pp_cl.scene.image_file import shrink
 from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.load import load_scene
@@ -81,6 +85,20 @@ def test_one_colour_stays_one_colour(dev, name):
     undistorted = undistort(dev, image, CAMERA, LENSES[name])
     shown = undistorted[undistorted[..., 3] > 30][:, :3].astype(int)
     assert np.abs(shown - [200, 30, 90]).max() <= 4
+
+
+def test_threads_take_turns_on_the_device(monkeypatch):
+    """Each kernel keeps the arguments of one launch."""
+    busy = threading.Lock()
+
+    def undistorted(*_):
+        assert busy.acquire(blocking=False)
+        time.sleep(0.01)
+        busy.release()
+
+    monkeypatch.setattr(lens, "_undistorted", undistorted)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: undistort(None, None, CAMERA, LENSES["all"]), range(8)))
 
 
 def test_a_lens_that_folds_is_refused(tmp_path):

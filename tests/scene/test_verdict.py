@@ -16,8 +16,10 @@ from support.scenes import ring_cameras
 from pp_cl.config import configure, preset
 from pp_cl.engine.views import View
 from pp_cl.files.image import ORIENTATION, read_rgba, write_png
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import open_scene
 from pp_cl.scene.readers.frame import GL_FROM_CV
+from pp_cl.scene.readings import read_as
 from pp_cl.scene.verdict import MOST_BESIDE, WrongCameras, judged
 from tools.convert_scene import convert
 
@@ -199,6 +201,18 @@ def test_wrong_masks_of_some_are_no_wrong_cameras(dev, tmp_path, count):
         write_png(file, image)
     _, beside = judge(dev, folder)
     assert beside == 0 if count == 0 else beside > MOST_BESIDE
+
+
+@pytest.mark.parametrize("axes, order", [("by-number next", "c b a"), ("next by-number", "b a c")])
+def test_two_orders_are_read_one_after_the_other(axes, order):
+    cameras = dict(zip("abc", ring_cameras(3, 8), strict=True))  # of 1.png, 2.png and 10.png
+    files = [
+        ImageFile(f"{i}.png", camera)
+        for i, camera in zip((1, 2, 10), cameras.values(), strict=True)
+    ]
+    read = read_as(files, axes, ("camera-to-world", "opengl"))
+    for image_file, name in zip(read, order.split(), strict=True):
+        np.testing.assert_array_equal(image_file.camera.pose, cameras[name].pose)
 
 
 def test_pictures_are_turned_where_their_masks_fit_only_so(dev, tmp_path):

@@ -82,6 +82,22 @@ def test_a_video_for_pages_lasts_as_long_as_it_should(tmp_path, suffix, fps):
     assert len(lasts) == 9 and sum(lasts) == pytest.approx(9000 / fps, abs=5.001)
 
 
+def test_a_transparent_gif_leaves_no_trails(tmp_path):
+    write_video(tmp_path / "12:30.gif", moving_square(), 10)
+    with Image.open(tmp_path / "12:30.gif") as image:
+        for expected in moving_square():
+            shown = np.asarray(image.convert("RGBA"))[..., 3] > 0
+            np.testing.assert_array_equal(shown, expected[..., 3] > 0)
+            image.seek(min(image.tell() + 1, image.n_frames - 1))
+
+
+def moving_square():
+    for i in range(4):
+        frame = np.zeros((32, 32, 4), np.uint8)
+        frame[8:16, 6 * i : 6 * i + 8] = (200, 60, 30, 255)
+        yield frame
+
+
 def test_webm_keeps_what_is_transparent(tmp_path):
     path = tmp_path / "video.webm"
     write_video(path, frames(channels=4), 10)

@@ -4,6 +4,7 @@
 
 import math
 import warnings
+from collections import Counter
 from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -177,7 +178,12 @@ def _of_one_shape(file, data, image_files, left_out):
     if data.get("camera_angle_x") is None or {"fl_x", "w"} & data.keys():
         return image_files
     sizes = [(image_file.camera.width, image_file.camera.height) for image_file in image_files]
-    usual = max(sizes, key=lambda size: sum(same_shape(size, other) for other in sizes), default=())
+    counts = Counter(sizes)
+    usual = max(
+        counts,
+        key=lambda size: sum(n for other, n in counts.items() if same_shape(size, other)),
+        default=(),
+    )
     others = [
         image_file.name
         for image_file, size in zip(image_files, sizes, strict=True)

@@ -99,7 +99,9 @@ def test_minutes_that_allow_for_larger_images_train_anew(made, capsys, monkeypat
     before = (folder / "run/checkpoint.npz").read_bytes()
     passed = json.loads((folder / "make.json").read_text())["passed"]
     words = ["make", scene, "--out", str(folder), "--minutes", f"{passed + 0.4:.3f}"]
+    write_json(folder / "run/length.json", {"metres_per_unit": 2.0})
     assert main(words) == 0
+    assert json.loads((folder / "run/length.json").read_text()) == {"metres_per_unit": 2.0}
     if downscale == 1:
         assert "extends a finished training" in capsys.readouterr().out
         assert load_header(folder / "run")["step"] > step

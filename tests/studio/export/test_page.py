@@ -255,6 +255,34 @@ def test_mouse_and_keys_move_the_camera(page):
     assert rise[0] - rise[1] == pytest.approx(20 / 200, abs=1e-4)
 
 
+def test_the_eye_does_not_reach_the_target(page):
+    """There would be no direction, and so no way back."""
+    script = """
+        const key = (key, more) => dispatchEvent(new KeyboardEvent("keydown", { key, ...more }));
+        for (let i = 0; i < 300; i++) key("+");
+        for (let i = 0; i < 300; i++) key("-");
+        key("-", { ctrlKey: true });  // the browser's own
+        await new Promise((done) => setTimeout(done, 1000));
+        return { address: location.hash };"""
+    effects, header = ask(page, script), header_of(page)
+    distance = np.linalg.norm(in_address(effects, "eye") - in_address(effects, "target"))
+    assert distance == pytest.approx(header["nearest"] / 0.9**300, rel=1e-3)
+
+
+def test_a_context_that_was_lost_comes_back(page):
+    script = """
+        const gl = ppcl.canvas.getContext("webgl2"), lost = gl.getExtension("WEBGL_lose_context");
+        const wait = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
+        const shown = () => { ppcl.show(); return ppcl.canvas.toDataURL(); };
+        const before = shown();
+        lost.loseContext(); await wait(300);
+        const without = shown();
+        lost.restoreContext(); await wait(300);
+        return { before, without, after: shown() };"""
+    effects = ask(page, script)
+    assert effects["before"] == effects["after"] != effects["without"]
+
+
 def test_what_rests_after_a_movement_is_drawn_in_full(page):
     """During a movement, frames may be coarser and sorted in a slightly older order."""
     with new_page(page.as_uri()) as tab:
