@@ -222,9 +222,7 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
     side does. The object is the part of the masks' hull that most windows see, since hardly any
     mask bounds the rest.
     """
-    hull, *_, voxel_size = forgiving_hull(windows, box)
-    inside = [window.inside(hull)[0] for window in track(windows, "where the object ends", "image")]
-    seeing = np.bincount(np.concatenate(inside), None, len(hull))
+    hull, _, seeing, voxel_size = forgiving_hull(windows, box)
     hull = hull[seeing >= MOSTLY_SEEN * len(windows)]
     if not len(hull):
         return None

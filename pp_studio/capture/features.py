@@ -316,7 +316,7 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
         shared = sum(
             is_still.sum() >= max(LEAST_MATCHES, len(is_still) / 2) for is_still in counted
         )
-        if not is_turntable and shared < LEAST_PAIRS * len(counted):
+        if not is_turntable and (not counted or shared < LEAST_PAIRS * len(counted)):
             return False
         votes = [np.zeros((len(place), 2), int) for place in places]
         for (_, i, j, m), is_still in zip(pairs, still, strict=True):

@@ -197,7 +197,8 @@ def _take(folder, file, target):
         return facts | {"reason": f"is no image of a known kind ({', '.join(FORMATS)})"}
     except Exception as error:  # decoders raise all kinds of exceptions on broken bytes
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
-    has_alpha = upright.has_transparency_data
+    alpha = upright.convert("RGBA").getchannel("A") if upright.has_transparency_data else None
+    has_alpha = alpha is not None and alpha.getextrema()[0] < 255
     facts |= _look(upright) | {"uniform": not has_alpha and _is_uniform(upright)}
     suffix = COPIED[image.format] if is_copied else ".png" if has_alpha else ".jpg"
     facts["name"] = target.name + suffix

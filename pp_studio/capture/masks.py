@@ -60,6 +60,7 @@ def write_masks(
     command: str | None = None,
     turns: bool = False,
     grows: bool = False,
+    grown: Callable[[np.ndarray], object] = lambda _: None,
 ) -> tuple[str, list[str], np.ndarray]:
     """Write the mask of each photograph to mask_file(), 8-bit gray, white on the object. Existing
     masks are kept and help to make the others. Returns one line on what was done, the names of
@@ -70,10 +71,11 @@ def write_masks(
     the indices (M,) of the points that it shows. given: a folder of masks of the distorted
     photographs, whose names may be those of the photographs' sources; sources: {name: source};
     fitted(name, mask): turns such a mask, (H, W) uint8, into the image's. command: runs a program
-    that makes masks; {image} and {mask} stand for the files. turns: the object turns before a
-    still background. grows: enlarge the box if it cuts off a part of the object. Raises UserError
-    for missing or broken given masks, a program that fails, a box in which nothing is seen, and an
-    object that has the colour of its uniform background.
+    that makes masks; {image} and {mask} stand for the files. turns: the object turns before a still
+    background. grows: enlarge the box if it cuts off a part of the object; grown(box) is called
+    then, before any mask that needs it is written. Raises UserError for missing or broken given
+    masks, a program that fails, a box in which nothing is seen, and an object that has the colour
+    of its uniform background.
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
@@ -105,6 +107,7 @@ def write_masks(
                 if larger is None:
                     break
                 box = larger
+                grown(box)
                 reading = track(in_view, "reading images", "image")
                 windows = [_window(scene, image_file, box) for image_file in reading]
             of_name = dict(zip([image_file.name for image_file in in_view], windows, strict=True))

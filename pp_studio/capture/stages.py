@@ -328,6 +328,9 @@ class Capture:
         points, seen_points = poses.points(model, FOLLOWED)
         files = self._found("frames")["images"] if self.source.is_dir() else []
 
+        def keep(larger):  # the masks that are kept may be all, when this is resumed
+            write_json(self._file("box"), self._found("box") | {"box": larger.tolist()})
+
         def write(chosen):
             return masks.write_masks(
                 self.scene,
@@ -341,6 +344,7 @@ class Capture:
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
                 grows=self.options["box"] is None and edits.box is None,
+                grown=keep,
             )
 
         used = [

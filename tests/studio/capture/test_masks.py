@@ -124,7 +124,9 @@ def test_a_box_that_cuts_the_object_grows(capture):
     assert capture.agreement().min() < 0.8 and (capture.box == cut_off).all()
     for i in range(VIEWS):
         capture.file(i).unlink()
-    capture.write(grows=True)
+    boxes = []
+    capture.write(grows=True, grown=boxes.append)
+    assert (boxes[-1] == capture.box).all()
     assert capture.agreement().min() > 0.95
     assert (capture.box[1, [0, 2]] > 0.8).all() and capture.box[0, 2] == cut_off[0, 2]
     assert (np.abs(capture.box) < 1.3 * whole[1]).all()
