@@ -55,7 +55,8 @@ def evaluate_run(
         run.render(views[0].camera)
     for i, view in enumerate(track(views, "measuring", "view")):
         start = time.perf_counter()
-        rendered = run.renderer.forward(view.camera, run.gamma)
+        between = run.depth_range(view.camera)
+        rendered = run.renderer.forward(view.camera, run.gamma, depth_range=between)
         image, computed = run.checked(run.shown(rendered)), rendered.computed_fraction
         costs.append((time.perf_counter() - start, computed))
         del rendered  # free its arrays before the next view, which may need larger ones
@@ -64,7 +65,7 @@ def evaluate_run(
         truth = view.ignoring(truth, image)
         rows.append({"name": view.name} | measure(image, truth))
         if "exposed" in run.header:
-            coloured = coloured_alike(image, truth, alpha)
+            coloured = view.ignoring(coloured_alike(image, truth, alpha), truth)
             rows[-1]["after_colour"] = measure(coloured, truth)
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))

@@ -18,6 +18,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.depth import depth_forward
+from pp_cl.engine.raster.footprint import MOST_OFFSET
 from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.engine.stored import load_model
 from pp_cl.engine.training.schedule import gamma_at, supersampling_at
@@ -235,7 +236,8 @@ class Run:
         """
         images = [result.clamped()]
         for other in self.others:
-            images.append(other.renderer.render(result.camera, other.gamma, **options))
+            own = options | {"depth_range": other.depth_range(result.camera)}
+            images.append(other.renderer.render(result.camera, other.gamma, **own))
         return images[0] if len(images) == 1 else np.mean(images, 0)
 
     @property
@@ -258,7 +260,8 @@ class Run:
             return None
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.eye - centre))
-        return max(distance - radius, self.nearest), distance + radius
+        reach = radius + self.renderer.point_radius * math.exp(MOST_OFFSET)  # points are not cut
+        return max(distance - reach, self.nearest), distance + radius
 
 
 def scene_is_there(path: str) -> bool:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl import __version__
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.engine.network.unet import UNet
@@ -312,7 +313,8 @@ class Measurement:
 
 def frame(run: Run, camera: Camera) -> np.ndarray:
     """(H, W, 3) float32 in [0, 1]: the image that the run shows to a camera."""
-    return run.checked(run.shown(run.renderer.forward(camera, run.gamma)))
+    between = run.depth_range(camera)
+    return run.checked(run.shown(run.renderer.forward(camera, run.gamma, depth_range=between)))
 
 
 def release(run: Run) -> None:
@@ -399,6 +401,7 @@ def _key(renderings):
             sums.append([[entry.filename, entry.CRC] for entry in archive.infolist()])
     dev = renderings.run.dev
     about = [sums, asdict(renderings.default), dev.name, dev.info["platform"]]
+    about += [dev.info["driver"], __version__]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 

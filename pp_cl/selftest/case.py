@@ -127,7 +127,8 @@ def _largest(actual, expected, scale):
     with np.errstate(all="ignore"):
         error = np.abs(actual - expected)
         error = np.where(np.isfinite(error), error, np.inf)
-        return float(np.where(error > 0, error / scale, 0.0).max(initial=0))
+        shares = np.where(error > 0, error / scale, 0.0)
+        return float(np.where(np.isnan(shares), np.inf, shares).max(initial=0))
 
 
 def _same_shape(actual, expected):

@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,6 +87,13 @@ def test_the_table_names_default_and_frontier(whole, capsys):
 def row(ms, psnr, early_stop=0.01, least=None, **more):
     fields = {"ms": ms, "ms_range": [least or ms - 1, ms + 1], "psnr": psnr, "is_default": False}
     return fields | {"setting": {"early_stop": early_stop, "samples": 4}} | more
+
+
+def test_a_frame_is_what_the_run_shows_to_a_camera_nearby(run):
+    """Nearer than those of the training, whose depth range would cut the object."""
+    far = run.cameras()[0]
+    near = replace(far, pose=far.pose * [1, 1, 1, 0.5])
+    np.testing.assert_array_equal(frame(run, near), run.render(near).colour)
 
 
 def test_the_fastest_row_is_hardly_worse_than_the_default():
