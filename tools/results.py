@@ -114,11 +114,11 @@ CURVES = [
     Training(name, scene, preset, None, downscale, test, minutes=minutes)
     for name, scene, preset, downscale, test, budgets in (
         ("lego", LEGO, "tiny", 4, ALL_VIEWS, (0.5, 1, 2, 4)),
-        ("lego", LEGO, "small", 2, ALL_VIEWS, (1.5, 3, 6, 12)),
+        ("lego", LEGO, "small", 2, ALL_VIEWS, (1, 2, 4, 8)),
         ("lego", LEGO, "full", 1, ALL_VIEWS, (2, 4, 8, 16)),
-        ("ethiopian_head, 57 photographs", HEAD, "tiny", None, None, (0.5, 1, 2, 4)),
-        ("mary_rose, 60 photographs", "real/mary_rose", "tiny", None, None, (0.5, 1, 2, 4)),
-        ("DTU scan37, 42 photographs", "real/dtu_scan37", "tiny", None, None, (0.5, 1, 2, 4)),
+        ("ethiopian_head, 57 photographs", HEAD, "tiny", None, None, (0.5, 1, 2)),
+        ("mary_rose, 60 photographs", "real/mary_rose", "tiny", None, None, (0.5, 1, 2)),
+        ("DTU scan37, 42 photographs", "real/dtu_scan37", "tiny", None, None, (0.5, 1, 2)),
     )
     for minutes in budgets
 ]
