@@ -81,7 +81,8 @@ def bending(depth: np.ndarray, has_surface: np.ndarray) -> tuple[float, np.ndarr
     """(depth loss, its gradient (H, W)) of depths (H, W) in voxels. has_surface: (H, W) bool."""
     gradient, total = np.zeros(depth.shape), 0.0
     for axis in (0, 1):
-        z, where, sums = (np.moveaxis(a, axis, 0) for a in (depth, has_surface, gradient))
+        z, sums = (np.moveaxis(a, axis, 0) for a in (depth, gradient))
+        where = np.moveaxis(has_surface, axis, 0)
         for s in (1, 2, 4):
             if len(z) <= 2 * s:
                 continue

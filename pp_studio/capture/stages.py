@@ -306,8 +306,8 @@ class Capture:
         given_box = self.options["box"]
         chosen = world.box if given_box is None else np.sort(np.reshape(given_box, (2, 3)), axis=0)
         if given_box is not None and read_edits(self.scene).box is not None:
-            what = "has a box, which is used in place of --box; remove it there to use --box"
-            warnings.warn(f"{self.scene / 'pp_cl.json'}: {what}", stacklevel=2)
+            what = "the box set on its page is used in place of --box; remove it there to use --box"
+            warnings.warn(f"{self.scene}: {what}", stacklevel=2)
         _move(model, world.scale, world.rotation, world.shift)
         eyes = [image_file.camera.eye for image_file in poses.image_files(model)]
         distance = np.median(np.linalg.norm(eyes, axis=1))

@@ -371,7 +371,7 @@ def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
     assert len(list((scene / "masks").iterdir())) == COUNT
     assert found(scene, "masks")["line"].startswith(f"{COUNT - 1} given")
     status, (warning,) = capture(shot[0], scene, "--masks", shot[1], "--box=-1,-1,-1,1,1,1")
-    assert status == 0 and "pp_cl.json: has a box, which is used in place of --box" in warning
+    assert status == 0 and "the box set on its page is used in place of --box" in warning
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == edits["box"]
 
 
