@@ -4,6 +4,7 @@ from .grid import Grid as Grid
 from .grid import smallest_voxel_size as smallest_voxel_size
 from .model import Model as Model
 from .network.first_features import FirstFeatures as FirstFeatures
+from .network.specular import Specular as Specular
 from .network.unet import UNet as UNet
 from .raster.points import PointCloud as PointCloud
 from .render import Renderer as Renderer
@@ -11,6 +12,7 @@ from .render import RenderResult as RenderResult
 from .step import Trainer as Trainer
 from .training.crops import Crop as Crop
 from .training.crops import Crops as Crops
+from .training.specular import SpecularFit as SpecularFit
 from .training.target import Target as Target
 from .views import MIN_SIDE as MIN_SIDE
 from .views import View as View

@@ -14,7 +14,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.layers import parameter_table, unet_layers
-from pp_cl.engine.network.specular import Specular, specular_layers
+from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import (
     OPACITIES,
@@ -53,8 +53,7 @@ def stored_table(
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if has_specular:
-        layer = parameter_table(specular_layers())
-        table |= {f"specular.{name}": row for name, row in layer.items()}
+        table |= {f"specular.{name}": row for name, row in Specular.table().items()}
     if step is not None:
         table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
         state = PointState.table(n)

@@ -70,7 +70,7 @@ precision highp usampler2D;
 layout(location = 0) in uint row;       // of the Gaussian
 uniform usampler2D gaussians;
 uniform vec3 eye;                       // from the box's corner
-uniform float unit, low[9], span[9], nearest;
+uniform float unit, low[9], span[9], nearest, extent;
 uniform vec2 logarithms;                // of deviations: the least, and the span
 uniform float widened, low_pass;        // pixels^2 on the screen: in all, of what was fitted
 uniform mat3 axes;                      // columns: right, down, forward
@@ -78,7 +78,7 @@ uniform vec4 focal;                     // fx, fy, cx, cy
 uniform vec2 size;
 out vec2 deviation;                     // from the centre, in standard deviations
 flat out vec4 colour;
-flat out float reach;
+flat out float reach, depth;            // depth: in extents of the scene
 uint at(uvec2 two[5], int k) {          // the byte k
   uint word = (k & 4) == 0 ? two[k >> 3].x : two[k >> 3].y;
   return (word >> uint(8 * (k & 3))) & 255u;
@@ -91,6 +91,7 @@ void main() {
   vec3 place = unit * vec3(two[0].x & 65535u, two[0].x >> 16, two[0].y & 65535u);
   vec3 towards = place - eye, centre = towards * axes;
   if (centre.z < nearest) return;
+  depth = centre.z / extent;
   vec3 own = vec3(at(two, 7), at(two, 8), at(two, 9)) / 255.0;
   own = exp(logarithms.x + logarithms.y * own);
   vec3 q = (vec3(at(two, 10), at(two, 11), at(two, 12)) - 128.0) / 240.0;
@@ -144,23 +145,72 @@ const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 deviation;
 flat in vec4 colour;
-flat in float reach;
-out vec4 result;
+flat in float reach, depth;
+layout(location = 0) out vec4 result;
+layout(location = 1) out vec4 depths;   // x: the mean depth times alpha
 void main() {
   float square = dot(deviation, deviation);
   if (square > reach * reach) discard;
   float alpha = min(0.99, colour.a * exp(-0.5 * square));
   result = vec4(colour.rgb * alpha, alpha);
+  depths = vec4(depth * alpha, 0.0, 0.0, alpha);
 }`;
-const COPY_VERTEX = `#version 300 es
+const FINISH_VERTEX = `#version 300 es
 void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
-const COPY_FRAGMENT = `#version 300 es
+// Copies the image to the canvas and adds reflections: the specular layer of cl/layers/specular.cl,
+// if the Gaussians have one. Its weights are as page.py's pack_specular() orders them.
+const layer = Uint8Array.from(atob(header.specular), (character) => character.charCodeAt(0));
+const FINISH_FRAGMENT = `#version 300 es
 precision highp float;
-uniform sampler2D image;
+precision highp sampler2D;
+uniform sampler2D image, depths;
+uniform vec3 eye;                       // from the scene's middle, in its extents
+uniform mat3 axes;
+uniform vec4 focal;
+uniform float height;
+layout(std140) uniform Layer { vec4 weights[${Math.max(1, layer.length / 16)}]; };
 out vec4 result;
-void main() { result = vec4(texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb, 1.0); }`;
+vec4 hidden[8];
+int next;
+void begin() { for (next = 0; next < 8; next++) hidden[next] = weights[next]; }
+void take(float x) {                    // the next input of the first layer
+  for (int j = 0; j < 8; j++) hidden[j] += x * weights[next + j];
+  next += 8;
+}
+void take(vec3 d) { take(d.x); take(d.y); take(d.z); }
+void encode(vec3 d, int octaves) {      // as NeRF encodes positions
+  take(d);
+  for (int k = 0; k < octaves; k++) {
+    vec3 angle = 1.57079633 * exp2(float(k)) * d;
+    take(sin(angle));
+    take(cos(angle));
+  }
+}
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  vec4 seen = texelFetch(image, pixel, 0);
+  result = vec4(seen.rgb, 1.0);
+  if (${layer.length} == 0 || seen.a < 0.02) return;
+  vec2 across = (vec2(gl_FragCoord.x, height - gl_FragCoord.y) - focal.zw) / focal.xy;
+  vec3 direction = normalize(axes * vec3(across, 1.0));
+  begin();
+  take(seen.rgb);
+  take(1.0 - seen.a);
+  encode(direction, 4);
+  encode(eye + texelFetch(depths, pixel, 0).x / seen.a * direction, 2);
+  vec4 second[8];
+  for (int j = 0; j < 8; j++) second[j] = weights[next + j];
+  next += 8;
+  for (int i = 0; i < 32; i++, next += 8) {
+    float x = max(0.0, hidden[i >> 2][i & 3]);
+    for (int j = 0; j < 8; j++) second[j] += x * weights[next + j];
+  }
+  vec4 added = weights[next++];
+  for (int i = 0; i < 32; i++) added += max(0.0, second[i >> 2][i & 3]) * weights[next++];
+  result.rgb += 0.5 * seen.a * added.rgb;
+}`;
 
 function compiled(gl, ...sources) {
   const program = gl.createProgram();
@@ -188,9 +238,10 @@ function makeDrawer(gl) {
   // into, the canvas must do
   const deep = gl.getExtension("EXT_color_buffer_float")
     || gl.getExtension("EXT_color_buffer_half_float");
-  const program = compiled(gl, VERTEX, FRAGMENT), copy = compiled(gl, COPY_VERTEX, COPY_FRAGMENT);
-  const places = {};
-  const place = (name) => places[name] ??= gl.getUniformLocation(program, name);
+  const program = compiled(gl, VERTEX, FRAGMENT);
+  const finish = compiled(gl, FINISH_VERTEX, FINISH_FRAGMENT);
+  const placesOf = (used, known = {}) => (name) => known[name] ??= gl.getUniformLocation(used, name);
+  const place = placesOf(program), last = placesOf(finish);
   const instances = gl.createVertexArray(), nothing = gl.createVertexArray();
   gl.bindVertexArray(instances);
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -203,20 +254,29 @@ function makeDrawer(gl) {
   gl.useProgram(program);
   gl.uniform1f(place("unit"), header.unit);
   gl.uniform1f(place("nearest"), header.nearest);
+  gl.uniform1f(place("extent"), header.extent);
   gl.uniform1fv(place("low"), header.low);
   gl.uniform1fv(place("span"), header.span);
   gl.uniform2fv(place("logarithms"), header.logarithms);
+  gl.useProgram(finish);
+  gl.uniform1i(last("depths"), 1);
+  gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, gl.createBuffer());
+  gl.bufferData(gl.UNIFORM_BUFFER, layer.length ? layer : 16, gl.STATIC_DRAW);
   const target = deep ? gl.createFramebuffer() : null;
-  let texture = null, targetSize = "", uploaded = null;
+  const attachments = [gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1].slice(0, layer.length ? 2 : 1);
+  let textures = [], targetSize = "", uploaded = null;
 
   function resize(width, height) {
     if (!deep || targetSize === `${width}x${height}`) return;
     targetSize = `${width}x${height}`;
-    gl.deleteTexture(texture);
-    texture = nearestTexture(gl, gl.RGBA16F, width, height);
+    textures.forEach((texture) => gl.deleteTexture(texture));
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.framebufferTexture2D(
-      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    textures = attachments.map((attachment) => {
+      const texture = nearestTexture(gl, gl.RGBA16F, width, height);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, texture, 0);
+      return texture;
+    });
+    gl.drawBuffers(attachments);
   }
 
   // camera: pose (12 numbers, camera to world, by rows), fx, fy, cx, cy, width, height in pixels.
@@ -226,17 +286,18 @@ function makeDrawer(gl) {
     resize(camera.width, camera.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, camera.width, camera.height);
-    gl.clearColor(1, 1, 1, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.clearBufferfv(gl.COLOR, 0, [1, 1, 1, 0]);
+    if (textures.length > 1) gl.clearBufferfv(gl.COLOR, 1, [0, 0, 0, 0]);
     gl.useProgram(program);
     gl.bindVertexArray(instances);
     if (uploaded !== order) gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
     uploaded = order;
     gl.bindTexture(gl.TEXTURE_2D, stored);
     gl.uniform3fv(place("eye"), eye);
-    gl.uniformMatrix3fv(
-      place("axes"), false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
-    gl.uniform4f(place("focal"), camera.fx, camera.fy, camera.cx, camera.cy);
+    const axes = [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]];
+    const focal = [camera.fx, camera.fy, camera.cx, camera.cy];
+    gl.uniformMatrix3fv(place("axes"), false, axes);
+    gl.uniform4fv(place("focal"), focal);
     gl.uniform2f(place("size"), camera.width, camera.height);
     // Gaussians look as they do in that window: what viewers widen them by grows with them, and a
     // pixel that shows several of the window's is their mean
@@ -249,9 +310,17 @@ function makeDrawer(gl) {
     if (!deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
-    gl.useProgram(copy);
+    gl.useProgram(finish);
+    gl.uniform3fv(last("eye"), scaled(add(eye, header.corner), 1 / header.extent));
+    gl.uniformMatrix3fv(last("axes"), false, axes);
+    gl.uniform4fv(last("focal"), focal);
+    gl.uniform1f(last("height"), camera.height);
     gl.bindVertexArray(nothing);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
+    textures.forEach((texture, i) => {
+      gl.activeTexture(gl.TEXTURE0 + i);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    gl.activeTexture(gl.TEXTURE0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   };
 }

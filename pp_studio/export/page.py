@@ -80,6 +80,24 @@ def _nearest_axes(deviations, turn):
     return kept, np.rint(turned[:, :3] * TURNED + 128).astype(np.uint8)
 
 
+def pack_specular(parameters: dict[str, np.ndarray] | None) -> str:
+    """The specular layer of Gaussians as base64 of float32, or "" without one: of each of its three
+    convolutions the biases, then for each input the weights of all outputs. Inputs 3 to 15, which
+    are equal in an image of Gaussians, are summed into one.
+    """
+    if not parameters:
+        return ""
+    parts: list[np.ndarray] = []
+    for name in "abc":
+        weight, bias = parameters[f"{name}.weight"][:, 0, 0], parameters[f"{name}.bias"]
+        rows = weight.transpose(1, 0, 2).reshape(weight.shape[1], -1)
+        if name == "a":
+            rows = np.concatenate([rows[:3], rows[3:16].sum(0, keepdims=True), rows[16:]])
+        count = 4 if name == "c" else len(bias)
+        parts += [bias[:count], rows[:, :count].ravel()]
+    return base64.b64encode(np.concatenate(parts).astype("<f4").tobytes()).decode()
+
+
 def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still: str = "") -> str:
     """The HTML of the page. cameras: those of the training. still: the file of an image that stands
     for the page in links, "" for none.
@@ -96,6 +114,9 @@ def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still
     header = about | {
         "count": len(rows),
         "origin": (gaussians.origin + corner).tolist(),
+        "corner": corner,
+        "extent": gaussians.extent,
+        "specular": pack_specular(gaussians.specular),
         "nearest": NEAREST * radius,
         "centre": centre.tolist(),
         "pixel": float(np.median(pixels)),

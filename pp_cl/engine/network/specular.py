@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.network.layers import Layer
+from pp_cl.engine.network.layers import Layer, parameter_table
 from pp_cl.engine.network.unet import Network
 
 HIDDEN = 32  # channels of both hidden layers
@@ -32,6 +33,11 @@ class Specular(Network):
 
     def __init__(self, dev: Device) -> None:
         super().__init__(dev, specular_layers())
+
+    @staticmethod
+    def table() -> Table:
+        """{name: (shape, dtype)} of its parameters."""
+        return parameter_table(specular_layers())
 
     def scale(self, factor: float) -> None:
         """Multiply its colours by a factor."""

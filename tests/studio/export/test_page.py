@@ -11,6 +11,7 @@ from support.browser import ask, image_of, new_page
 from support.scenes import ring_cameras
 from support.splats import draw_splats, splats_of
 
+from pp_cl.engine import Specular
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
@@ -20,8 +21,10 @@ from pp_studio.export.gaussians import (
     GAUSSIAN,
     Gaussians,
     check_drawable,
+    drawn_by,
     first_gaussians,
     fitted_gaussians,
+    window_camera,
 )
 from pp_studio.export.page import (
     PACKED,
@@ -38,7 +41,8 @@ def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(QUALITIES, QUICK, (300, 0.0))  # enough steps to look like the run
-        path.write_text(page_text(fitted_gaussians(run), run.cameras("train"), "ball"))
+        gaussians = fitted_gaussians(run)._replace(specular=None)
+        path.write_text(page_text(gaussians, run.cameras("train"), "ball"))
     return path
 
 
@@ -132,6 +136,31 @@ def test_a_browser_draws_gaussians_by_their_rules_in_all_sizes(run, page):
     cameras = [first.resized(*(2 * [round(times * first.width)])) for times in (0.8, 2, 5, 16)]
     for image, camera in zip(drawn(page, cameras), cameras, strict=True):
         assert psnr(image, predicted(page, camera)) > 42
+
+
+def test_a_browser_adds_the_reflections_that_the_engine_adds(run, page, tmp_path, rng):
+    header = header_of(page)
+    rows = np.frombuffer(base64.b64decode(element(page, "gaussians")), PACKED)
+    table, origin = unpacked(header, rows)
+    table["position"] += origin - run.model.grid.centre
+    layer = {
+        name: rng.normal(size=shape, scale=0.3).astype(dtype)
+        for name, (shape, dtype) in Specular.table().items()
+    }
+    plain = Gaussians(table, run.model.grid.centre, header["windows"], header["low_pass"])
+    mirror = plain._replace(specular=layer, extent=run.model.extent)
+    cameras = run.cameras("test")[:3]
+    images = []
+    for name, gaussians in (("plain", plain), ("mirror", mirror)):
+        (tmp_path / name).write_text(page_text(gaussians, run.cameras("train"), name))
+        shown = drawn(tmp_path / name, [camera.resized(96, 96) for camera in cameras])
+        finer = 96 / cameras[0].width
+        for image, camera in zip(shown, cameras, strict=True):
+            window = window_camera(camera.resized(96, 96), finer, gaussians)
+            wanted = to_8bit(drawn_by(run, gaussians).render(window).colour)
+            assert psnr(image, wanted) > 40
+        images.append(shown)
+    assert psnr(images[0][0], images[1][0]) < 25
 
 
 def test_before_the_fit_it_shows_the_points(run, tmp_path):

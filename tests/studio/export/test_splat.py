@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.gltf import glb
 from support.splats import colours, draw_splats, read_splats
 
-from pp_cl.engine import FirstFeatures, Model, Renderer
+from pp_cl.engine import FirstFeatures, Model, Renderer, Specular
 from pp_cl.engine.raster.footprint import MOST_OF_GAUSSIANS
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
@@ -112,7 +112,7 @@ def likeness(run, path, scale):
 
 
 def test_the_engine_draws_them_as_viewers_do(run, ply):
-    ply_splats, kept = read_splats(ply), fitted_gaussians(run)
+    ply_splats, kept = read_splats(ply), fitted_gaussians(run)._replace(specular=None)
     least, most = kept.windows
     drawn = drawn_by(run, kept)
     for scale in (least, 3, most):
@@ -171,10 +171,11 @@ def test_they_are_fitted_to_alpha(run, monkeypatch):
 
 
 def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
-    table, origin, *_ = fitted_gaussians(run)
+    table, origin, *_, specular, _ = fitted_gaussians(run)
     monkeypatch.setattr(gaussians, "Trainer", Mock(side_effect=InterruptedError))
-    again, *_ = fitted_gaussians(run)
+    again, *_, layer, _ = fitted_gaussians(run)
     assert np.array_equal(table, again)
+    assert all(np.array_equal(specular[name], layer[name]) for name in Specular.table())
     positions = table["position"] + origin
     assert cKDTree(run.model.positions()).query(positions)[0].max() < 4 * run.model.grid.voxel_size
     path = run.folder.path / "gaussians.npz"
@@ -187,6 +188,21 @@ def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
     monkeypatch.setitem(QUALITIES, QUICK, (401, 0.0))
     with pytest.raises(InterruptedError):
         fitted_gaussians(run)
+
+
+def test_a_specular_layer_adds_what_they_lack(run):
+    """Here it replaces their own colours by direction in views that it was not fitted to."""
+    fitted = fitted_gaussians(run)._replace(specular=None)
+    fitted.table["harmonics"][:, 1:] = 0
+    lacking = fitted._replace(specular=gaussians._fit_specular(run, fitted))
+    measured = []
+    for each in (fitted, lacking):
+        drawn, values = drawn_by(run, each), []
+        for camera in run.cameras("test"):
+            shown = drawn.render(window_camera(camera, 1.0, each)).colour
+            values.append(psnr(to_8bit(shown), to_8bit(run.render(camera).colour)))
+        measured.append(np.mean(values))
+    assert measured[1] > measured[0] + 0.3
 
 
 def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
