@@ -53,7 +53,7 @@ def stored_table(
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if has_specular:
-        table |= {f"specular.{name}": row for name, row in Specular.table().items()}
+        table |= {f"specular.{name}": row for name, row in Specular.shapes().items()}
     if step is not None:
         table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
         state = PointState.table(n)

@@ -207,12 +207,12 @@ def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians 
             key = str(stored["key"])
             is_kept = any(key == _key(run, quality) for quality in qualities)
             table = stored["gaussians"] if is_kept else np.empty(0)
-            names = [name for name in Specular.table() if LAYER + name in stored]
+            names = [name for name in Specular.shapes() if LAYER + name in stored]
             specular = {name: stored[LAYER + name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     found = {name: (array.shape, array.dtype) for name, array in specular.items()}
-    is_whole = table.dtype == GAUSSIAN and found in ({}, Specular.table())
+    is_whole = table.dtype == GAUSSIAN and found in ({}, Specular.shapes())
     return _fitted(run, table, specular) if is_whole else None
 
 
@@ -232,7 +232,7 @@ def _fit_specular(run, gaussians):
     (least, most), targets = gaussians.windows, Target(run.dev)
     sizes = [least * (most / least) ** (GOLDEN * i % 1) for i in range(len(views))]
     windowed = [
-        replace(view, camera=replace(view.camera, samples=size))
+        replace(view, stored_camera=replace(view.camera, samples=size))
         for view, size in zip(views, sizes, strict=True)
     ]
 

@@ -35,7 +35,7 @@ class Specular(Network):
         super().__init__(dev, specular_layers())
 
     @staticmethod
-    def table() -> Table:
+    def shapes() -> Table:
         """{name: (shape, dtype)} of its parameters."""
         return parameter_table(specular_layers())
 

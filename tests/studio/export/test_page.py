@@ -145,15 +145,16 @@ def test_a_browser_adds_the_reflections_that_the_engine_adds(run, page, tmp_path
     table["position"] += origin - run.model.grid.centre
     layer = {
         name: rng.normal(size=shape, scale=0.3).astype(dtype)
-        for name, (shape, dtype) in Specular.table().items()
+        for name, (shape, dtype) in Specular.shapes().items()
     }
     plain = Gaussians(table, run.model.grid.centre, header["windows"], header["low_pass"])
     mirror = plain._replace(specular=layer, extent=run.model.extent)
     cameras = run.cameras("test")[:3]
     images = []
     for name, gaussians in (("plain", plain), ("mirror", mirror)):
-        (tmp_path / name).write_text(page_text(gaussians, run.cameras("train"), name))
-        shown = drawn(tmp_path / name, [camera.resized(96, 96) for camera in cameras])
+        path = tmp_path / f"{name}.html"
+        path.write_text(page_text(gaussians, run.cameras("train"), name))
+        shown = drawn(path, [camera.resized(96, 96) for camera in cameras])
         finer = 96 / cameras[0].width
         for image, camera in zip(shown, cameras, strict=True):
             window = window_camera(camera.resized(96, 96), finer, gaussians)

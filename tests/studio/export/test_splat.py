@@ -175,7 +175,7 @@ def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
     monkeypatch.setattr(gaussians, "Trainer", Mock(side_effect=InterruptedError))
     again, *_, layer, _ = fitted_gaussians(run)
     assert np.array_equal(table, again)
-    assert all(np.array_equal(specular[name], layer[name]) for name in Specular.table())
+    assert all(np.array_equal(specular[name], layer[name]) for name in Specular.shapes())
     positions = table["position"] + origin
     assert cKDTree(run.model.positions()).query(positions)[0].max() < 4 * run.model.grid.voxel_size
     path = run.folder.path / "gaussians.npz"
@@ -185,15 +185,21 @@ def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
         with pytest.raises(InterruptedError):
             fitted_gaussians(run)
     path.write_bytes(whole)
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **(arrays | {"specular.a.bias": np.zeros(3, np.float32)}))
+    with pytest.raises(InterruptedError):
+        fitted_gaussians(run)
+    path.write_bytes(whole)
     monkeypatch.setitem(QUALITIES, QUICK, (401, 0.0))
     with pytest.raises(InterruptedError):
         fitted_gaussians(run)
 
 
 def test_a_specular_layer_adds_what_they_lack(run):
-    """Here it replaces their own colours by direction in views that it was not fitted to."""
+    """Here a part of their colours, in views that it was not fitted to."""
     fitted = fitted_gaussians(run)._replace(specular=None)
-    fitted.table["harmonics"][:, 1:] = 0
+    fitted.table["harmonics"][:, 0, :2] -= 0.4
     lacking = fitted._replace(specular=gaussians._fit_specular(run, fitted))
     measured = []
     for each in (fitted, lacking):
@@ -202,7 +208,7 @@ def test_a_specular_layer_adds_what_they_lack(run):
             shown = drawn.render(window_camera(camera, 1.0, each)).colour
             values.append(psnr(to_8bit(shown), to_8bit(run.render(camera).colour)))
         measured.append(np.mean(values))
-    assert measured[1] > measured[0] + 0.3
+    assert measured[1] > measured[0] + 1.5
 
 
 def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
