@@ -228,21 +228,18 @@ def _fit_specular(run, gaussians):
     """The parameters of a layer that adds what the Gaussians lack of the run's renderings of its
     training views, in windows of all sizes; {} if that does not help in views left out of the fit.
     """
-    views = run.rendered(evenly(run.image_files("train"), REFLECTING), opaque=True)
     (least, most), targets = gaussians.windows, Target(run.dev)
-    sizes = [least * (most / least) ** (GOLDEN * i % 1) for i in range(len(views))]
-    windowed = [
-        replace(view, stored_camera=replace(view.camera, samples=size))
-        for view, size in zip(views, sizes, strict=True)
-    ]
+    views = []
+    for view in run.rendered(evenly(run.image_files("train"), REFLECTING), opaque=True):
+        size = least * (most / least) ** (GOLDEN * len(views) % 1)
+        views.append(replace(view, stored_camera=replace(view.camera, samples=size)))
 
     def target(i):
         camera = views[i].camera
         return targets.crop(views[i], (0, 0, camera.width, camera.height))[0]
 
-    drawn = drawn_by(run, gaussians)
-    seed = run.config.train.seed
-    layer = SpecularFit(drawn.renderer, windowed, target, run.gamma, seed).fitted().layer
+    drawn, seed = drawn_by(run, gaussians), run.config.train.seed
+    layer = SpecularFit(drawn.renderer, views, target, run.gamma, seed).fitted().layer
     parameters = layer.parameters if layer else {}
     return {name: run.dev.download(array) for name, array in parameters.items()}
 

@@ -174,7 +174,6 @@ layout(std140) uniform Layer { vec4 weights[${Math.max(1, layer.length / 16)}]; 
 out vec4 result;
 vec4 hidden[8];
 int next;
-void begin() { for (next = 0; next < 8; next++) hidden[next] = weights[next]; }
 void take(float x) {                    // the next input of the first layer
   for (int j = 0; j < 8; j++) hidden[j] += x * weights[next + j];
   next += 8;
@@ -195,7 +194,7 @@ void main() {
   if (${layer.length} == 0 || seen.a < 0.02) return;
   vec2 across = (vec2(gl_FragCoord.x, height - gl_FragCoord.y) - focal.zw) / focal.xy;
   vec3 direction = normalize(axes * vec3(across, 1.0));
-  begin();
+  for (next = 0; next < 8; next++) hidden[next] = weights[next];
   take(seen.rgb);
   take(1.0 - seen.a);
   encode(direction, 4);
@@ -241,7 +240,7 @@ function makeDrawer(gl) {
   const program = compiled(gl, VERTEX, FRAGMENT);
   const finish = compiled(gl, FINISH_VERTEX, FINISH_FRAGMENT);
   const placesOf = (used, known = {}) => (name) => known[name] ??= gl.getUniformLocation(used, name);
-  const place = placesOf(program), last = placesOf(finish);
+  const place = placesOf(program), finishPlace = placesOf(finish);
   const instances = gl.createVertexArray(), nothing = gl.createVertexArray();
   gl.bindVertexArray(instances);
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -259,7 +258,7 @@ function makeDrawer(gl) {
   gl.uniform1fv(place("span"), header.span);
   gl.uniform2fv(place("logarithms"), header.logarithms);
   gl.useProgram(finish);
-  gl.uniform1i(last("depths"), 1);
+  gl.uniform1i(finishPlace("depths"), 1);
   gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, gl.createBuffer());
   gl.bufferData(gl.UNIFORM_BUFFER, layer.length ? layer : 16, gl.STATIC_DRAW);
   const target = deep ? gl.createFramebuffer() : null;
@@ -311,10 +310,10 @@ function makeDrawer(gl) {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
     gl.useProgram(finish);
-    gl.uniform3fv(last("eye"), scaled(add(eye, header.corner), 1 / header.extent));
-    gl.uniformMatrix3fv(last("axes"), false, axes);
-    gl.uniform4fv(last("focal"), focal);
-    gl.uniform1f(last("height"), camera.height);
+    gl.uniform3fv(finishPlace("eye"), scaled(add(eye, header.corner), 1 / header.extent));
+    gl.uniformMatrix3fv(finishPlace("axes"), false, axes);
+    gl.uniform4fv(finishPlace("focal"), focal);
+    gl.uniform1f(finishPlace("height"), camera.height);
     gl.bindVertexArray(nothing);
     textures.forEach((texture, i) => {
       gl.activeTexture(gl.TEXTURE0 + i);

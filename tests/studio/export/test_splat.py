@@ -200,9 +200,9 @@ def test_a_specular_layer_adds_what_they_lack(run):
     """Here a part of their colours, in views that it was not fitted to."""
     fitted = fitted_gaussians(run)._replace(specular=None)
     fitted.table["harmonics"][:, 0, :2] -= 0.4
-    lacking = fitted._replace(specular=gaussians._fit_specular(run, fitted))
+    mended = fitted._replace(specular=gaussians._fit_specular(run, fitted))
     measured = []
-    for each in (fitted, lacking):
+    for each in (fitted, mended):
         drawn, values = drawn_by(run, each), []
         for camera in run.cameras("test"):
             shown = drawn.render(window_camera(camera, 1.0, each)).colour
