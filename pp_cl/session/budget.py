@@ -2,19 +2,23 @@
 
 import statistics
 from collections import deque
-from dataclasses import replace
 
 from pp_cl.engine.training.schedule import refine_steps, supersampling_at
-from pp_cl.session.plan import NEVER, Plan
+from pp_cl.session.plan import Plan
 from pp_cl.settings import Config
 
 PLANS = 50  # made in the given minutes
 # share of the first step's time that later ones save: a third of the steps clears the fog
 FOG = 0.35
-# With fewer steps than this for each refinement, a training is better without any: in the time of
-# 250 steps of `small`, lego reaches 27.4 dB with its refinement and 29.8 without; in the time of
-# 800 steps, 31.5 and 32.3.
-LEAST_REFINED = 1000
+# With fewer steps than this, a training is better without a refinement: in the time of 250 steps of
+# `small`, lego reaches 27.4 dB with its refinement and 29.8 without; of 800 steps, 31.5 and 32.3;
+# of 1,160 steps, 33.1 and 32.7.
+FIRST_REFINED = 1000
+# With fewer steps than this after the first refinement, it is better without the second: in 8
+# minutes, 1,270 steps of `full`, lego reaches 31.5 dB with both and 33.5 with one; in 16 minutes,
+# 3,000 steps, 34.4 and 35.0. By these, both would be equal after 30 to 40 minutes. The second is
+# judged once the first is made: until then, images are small and steps cheap if it is to come.
+FURTHER_REFINED = 6000
 # A step without a refinement takes this many times as long as one on halved images: a guess, which
 # the next plan corrects.
 WHOLE = 1.5
@@ -26,7 +30,7 @@ FEWEST, MOST = 10, 100  # last steps whose median time counts: the first may bui
 
 class Budget:
     """Plans the steps of a training that has train.minutes. pixels: of all its views.
-    may_stay_coarse: whether the grid stays as it is if the steps are too few to refine it.
+    may_stay_coarse: whether refinements are left out that would have too few steps.
     """
 
     def __init__(self, config: Config, pixels: int, may_stay_coarse: bool = False):
@@ -55,12 +59,14 @@ class Budget:
         time_left = time_given - seconds - self._fitting
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
         time_left /= clearing * statistics.median(self._times)
-        plan = Plan.given(config).for_minutes(train, step, time_left, self._ending)
-        to_come = refine_steps(plan.train(train))
-        is_coarse = self._may_stay_coarse and all(at > step for at in to_come)
-        if is_coarse and plan.iterations < LEAST_REFINED * len(to_come):
-            self._times.clear()  # these were of images of another size
-            coarse = replace(plan, refine_at=NEVER)
-            plan = coarse.for_minutes(train, step, time_left / WHOLE, self._ending)
-        self._may_stay_coarse = False
-        return plan
+        given, refined = Plan.given(config), refine_steps(train)
+        to_come = sum(at > step for at in refined)
+        if self._may_stay_coarse and to_come:
+            since = max((at for at in refined if at <= step), default=0)
+            left = time_left / WHOLE ** (to_come - 1)
+            once = given.refined_at_most(1, step).for_minutes(train, step, left, self._ending)
+            if once.iterations - since < (FURTHER_REFINED if since else FIRST_REFINED):
+                self._times.clear()  # these were of images of another size
+                time_left /= WHOLE
+                given = given.refined_at_most(0, step)
+        return given.for_minutes(train, step, time_left, self._ending)

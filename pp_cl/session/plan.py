@@ -91,12 +91,21 @@ class Plan:
         """A plan without supersampling."""
         return replace(self, supersampled=0.0)
 
+    def refined_at_most(self, most: int, step: int) -> "Plan":
+        """A plan with at most `most` refinements after `step`, the first ones of this plan."""
+        planned = sorted(share for share in self.refine_at if share < 1)
+        dropped = [share for share in planned if share * self.iterations > step + 0.5][most:]
+        return replace(
+            self, refine_at=tuple(1.0 if share in dropped else share for share in self.refine_at)
+        )
+
     def for_minutes(
         self, train: TrainConfig, step: int, left: float, ending: float = 0.0
     ) -> "Plan":
         """A plan whose iterations take the time of `left` more steps after `step`, if none of these
         were refined. refine_at and supersampled change so that past events keep their steps. train:
-        other settings for the schedules. ending: the time that the end takes, in steps.
+        other settings for the schedules. ending: the time that the end takes, in steps that are
+        not supersampled.
         """
         train = self.train(train)
         steps, shares = self.iterations, [share for share in self.refine_at if 0 < share < 1]
@@ -114,7 +123,7 @@ class Plan:
         # no event is skipped: the first of these must lie after this step
         soonest = [1.0 if is_late else FIXED, *(share for share in shares if share not in past)]
         soonest += [] if begun else [begins]
-        left -= ending * DEARER ** len(to_come)
+        left -= ending * DEARER ** len(to_come) / (SUPERSAMPLED if begun else 1)
         planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / min(soonest)))
         if is_late and planned > steps:  # more steps would begin the averages anew
             return self

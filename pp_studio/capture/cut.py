@@ -152,18 +152,23 @@ def disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
+def are_inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(N,) bool, which of the points (N, 3) lie in a box (2, 3)."""
+    return ((points > box[0]) & (points < box[1])).all(1)
+
+
 def cut_out_all(
     windows: Sequence[Window],
     box: np.ndarray,
     points: np.ndarray,
-    inside: np.ndarray,
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
     """Set the masks of the windows that have none. box, points, seen, turns: as in write_masks().
-    inside: (N,) bool, the points in the box. Raises UserError for a box without an object.
+    Raises UserError for a box without an object.
     """
     cv2.setNumThreads(1)
+    inside = are_inside(points, box)
     unmasked = [i for i, window in enumerate(windows) if window.mask is None]
     labels = [
         _seeds(window, box, points, inside, visible)

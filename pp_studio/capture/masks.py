@@ -84,8 +84,9 @@ def write_masks(
     shown = [i for i, image_file in enumerate(image_files) if cut.place_of(image_file, box)]
     shown = shown or list(range(len(image_files)))  # window() then raises the error
     beside = {image_file.name for image_file in image_files} - {image_files[i].name for i in shown}
+    mask_of = {} if given is None else _given(given, unmasked, sources or {})
     for image_file in track(unmasked, "masks", "image"):
-        source, mask = _found(scene, image_file, given, sources or {}, fitted, words)
+        source, mask = _found(scene, image_file, mask_of, fitted, words)
         if mask is None and image_file.name in beside:  # such as at the beginning or end of a video
             source = "empty, as the object is outside"
             mask = np.zeros((image_file.camera.height, image_file.camera.width), np.uint8)
@@ -93,7 +94,7 @@ def write_masks(
             write_png(mask_file(scene, image_file.name), mask)
             how[source] = how.get(source, 0) + 1
     if _without_mask(scene, image_files):
-        inside = ((points > box[0]) & (points < box[1])).all(1)
+        inside = cut.are_inside(points, box)
         in_view, seen = [image_files[i] for i in shown], [seen[i] for i in shown]
         reading = track(in_view, "reading images", "image")
         windows = [_window(scene, image_file, box) for image_file in reading]
@@ -102,7 +103,7 @@ def write_masks(
         if unmasked := _without_mask(scene, in_view):
             how["cut out"] = len(unmasked)
             for growth in range(1 + cut.GROWTHS):
-                cut.cut_out_all(windows, box, points, inside, seen, turns)
+                cut.cut_out_all(windows, box, points, seen, turns)
                 larger = cut.grown_box(windows, box) if grows and growth < cut.GROWTHS else None
                 if larger is None:
                     break
@@ -135,12 +136,28 @@ def _without_mask(scene, image_files):
     ]
 
 
-def _found(scene, image_file, given_masks, sources, fitted, words):
+def _given(folder, image_files, sources):
+    """{name of a photograph: its mask in a folder}; raises UserError if it is another's, too."""
+    mask_of, source_of = {}, {}
+    for image_file in image_files:
+        name = Path(image_file.name).name
+        source = sources.get(name, name)
+        mask = mask_of[image_file.name] = named_mask(folder, source, name)
+        if mask in source_of:
+            raise UserError(
+                f"{mask}: the mask of {source_of[mask]} and of {source}; put masks in subfolders"
+                " like those of the photographs"
+            )
+        source_of[mask] = source
+    return mask_of
+
+
+def _found(scene, image_file, given, fitted, words):
     """(its source, (H, W) uint8 mask or None) of a photograph, without looking at the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
-    if given_masks is not None:
-        mask = named_mask(given_masks, sources.get(file.name, file.name), file.name)
-        return "given", fitted(image_file.name, read_mask_of_size(mask, size))
+    if image_file.name in given:
+        mask = read_mask_of_size(given[image_file.name], size)
+        return "given", fitted(image_file.name, mask)
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
     if not image_file.name.lower().endswith(OPAQUE):

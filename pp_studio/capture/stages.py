@@ -68,11 +68,17 @@ class Capture:
     """A capture in progress in the folder of a scene.
 
     given: {name: value} of the given OPTIONS; others are as in the captures before. tell: prints a
-    stage's line.
+    stage's line. device: the choice of open_device() that removes distortion.
     """
 
-    def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
-        self.scene, self.given, self.tell = scene, given, tell
+    def __init__(
+        self,
+        scene: Path,
+        given: dict[str, Any],
+        tell: Callable[[str], None],
+        device: str | None = None,
+    ) -> None:
+        self.scene, self.given, self.tell, self.device = scene, given, tell, device
         self.work, self.frames = scene / "capture", scene / "capture" / "frames"
         self.database, self.model = self.work / "database.db", self.work / "model"
         self.options: dict[str, Any] = {}
@@ -232,7 +238,7 @@ class Capture:
     @cached_property
     def _dev(self):
         """The device that removes distortion."""
-        return open_device()
+        return open_device(self.device)
 
     def _model(self):
         """pycolmap's model of the cameras, in its own world."""

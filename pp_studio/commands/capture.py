@@ -3,6 +3,7 @@
 import argparse
 from typing import Any
 
+from pp_cl.commands import options as shared
 from pp_studio.capture import STAGES
 
 HELP = "make a scene from photographs or a video: cameras, box and masks"
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="make the masks again, also those that were fixed by hand",
     )
+    shared.add_device(parser)
 
 
 def add_hints(parser: argparse.ArgumentParser) -> None:
@@ -59,9 +61,7 @@ def add_hints(parser: argparse.ArgumentParser) -> None:
 
 def _box(text):
     """Convert --box to AUTO or two corners."""
-    from pp_cl.commands.options import box
-
-    return text if text == AUTO else box(text)
+    return text if text == AUTO else shared.box(text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -83,6 +83,7 @@ def run(options: argparse.Namespace) -> None:
         own = None if options.masks in (None, AUTO) else str(Path(options.masks).resolve())
         command = None if options.mask_command == AUTO else options.mask_command
         given |= {"masks": own, "mask_command": command}
-    capture = Capture(Path(options.out), given, lambda line: print(line, flush=True))
+    out, device = Path(options.out), options.device
+    capture = Capture(out, given, lambda line: print(line, flush=True), device)
     capture.run(options.begin, replace_masks=options.replace_masks)
     print(f"look at it with `pp-cl info {options.out} --picture look.png`, then `pp-cl train`")

@@ -145,7 +145,7 @@ def run(options: argparse.Namespace) -> None:
             if not Path(scene, "transforms.json").exists():
                 clock.tell_of_capture(options.source)
             written = _written(scene)
-            step("capture", options.source, "--out", scene, *_hints(options))
+            step("capture", options.source, "--out", scene, *_hints(options), *device)
             if folder.checkpoint.exists() and _written(scene) != written:
                 print(f"the scene has changed; {_set_aside(folder)} is its model", flush=True)
             *stages, _ = STAGES  # the last one prints what it has written

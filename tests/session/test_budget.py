@@ -1,5 +1,6 @@
 import json
 import signal
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,6 +79,23 @@ def test_few_steps_are_better_without_refinement(step, is_refined):
             assert is_refined or plan.refine_at == NEVER
     assert bool(refine_steps(config.train)) == is_refined
     assert config.train.iterations < 1000 or is_refined
+
+
+@pytest.mark.parametrize("minutes, refinements", [(1, 0), (8, 1), (60, 2)])
+def test_a_refinement_with_too_few_steps_is_left_out(minutes, refinements):
+    train = TrainConfig(minutes=minutes, refine_at=(0.33, 0.67), supersampled=0.25, crop=256)
+    config, step, total, made = Config(train=replace(train, iterations=22000)), 0, 0.0, 0
+    budget = Budget(config, 100 * 800**2, may_stay_coarse=True)
+    seconds = {(0, 2): 0.03, (0, 1): 0.05, (0, 0): 0.1, (1, 1): 0.12, (1, 0): 0.13, (2, 0): 0.26}
+    while step < config.train.iterations:  # of `full`, by refinements made and to come
+        took = seconds[made, sum(step < at for at in refine_steps(config.train))]
+        took *= supersampling_at(step, config.train)
+        step, total = step + 1, total + took * (1 + 0.4 * np.exp(-9 * step / 22000))
+        made += step in refine_steps(config.train)
+        if plan := budget.plan(config, step, total):
+            config = plan.settings(config)
+    assert made == refinements
+    assert 0.75 * 60 * minutes < total + FITTING + 440 * seconds[made, 0] < 1.1 * 60 * minutes
 
 
 def test_a_training_without_time_ends_soon_and_in_order():

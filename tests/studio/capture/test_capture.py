@@ -213,6 +213,11 @@ def test_photographs_that_have_moved_are_the_same(captured, shot, tmp_path):
     refused(moved, scene, named="was made from")
 
 
+def test_distortion_is_removed_on_the_device_that_is_named(captured, shot, tmp_path):
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    refused(shot[0], scene, "--from", "images", "--device", "no such", named="device 'no such'")
+
+
 @pytest.mark.parametrize(
     "source, words, named",
     [

@@ -252,6 +252,20 @@ def test_given_masks_come_first(capture, tmp_path):
     assert (capture.agreement() == 1).all() and len(set(names)) == VIEWS
 
 
+def test_one_mask_is_not_taken_for_photographs_of_two_rounds(capture, tmp_path):
+    folder = given_masks(capture, tmp_path / "given")
+    sources = {"03.png": "near/03.png", "04.png": "far/03.png"}
+    with pytest.raises(UserError, match="03.png: the mask of near/03.png and of far/03.png"):
+        capture.write(given=folder, sources=sources)
+    assert not capture.file(0).exists()
+    for source in sources.values():
+        (folder / source).parent.mkdir()
+    (folder / "03.png").rename(folder / "near/03.png")
+    (folder / "04.png").rename(folder / "far/03.png")
+    assert f"{VIEWS} given" in capture.write(given=folder, sources=sources)
+    assert (capture.agreement() == 1).all()
+
+
 def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
     folder = given_masks(capture, tmp_path / "given")
     wrong = np.roll(capture.truth[4], SIZE // 3, axis=1)
