@@ -25,6 +25,7 @@ MOST_LINE = 2**16  # bytes of a row; pp-cl writes no longer ones
 MOST_NUMBER = 1e300  # in a row
 GOES_ON = "; the same command goes on"
 MOST_LEVELS = 4  # of nested lists and dictionaries in a row
+NUMBERS = ("loss", "psnr", "points")  # values of a row that commands read, beside step and seconds
 
 
 class RunFolder:
@@ -186,7 +187,7 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     """
     try:
         row = strict_json(line) if len(line) <= MOST_LINE else {}
-        numbers = [row["step"], row["seconds"], row.get("loss", 0), row.get("psnr", 0)]
+        numbers = [row["step"], row["seconds"], *(row.get(name, 0) for name in NUMBERS)]
         is_row = type(numbers[0]) is int and all(type(n) in (int, float) for n in numbers)
         is_row = is_row and min(numbers[:2]) >= 0 and type(row.get("device", "")) is str
         return row if is_row and _is_loggable(row) else None

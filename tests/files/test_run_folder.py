@@ -60,6 +60,7 @@ def test_a_log_of_at_most_so_many_bytes(folder, monkeypatch):
         b'{"step": 10, "seconds": 0.1}',
         b'{"step": 10, "seconds": ' + b"9" * 400 + b"}",
         b'{"step": 10, "seconds": 1.0, "psnr": "20"}',
+        b'{"step": 10, "seconds": 1.0, "points": [301]}',
         b'{"step": 10, "seconds": 1.0, "rates": {"sh": [1, -Infinity]}}',
         b'{"step": 10, "seconds": 1.0, "device": [1]}',
         b'{"step": 10, "seconds": 1.0, "x": "' + b"y" * 2**17 + b'"}',
