@@ -15,10 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-if not hasattr(os, "fork"):
-    pytest.skip("needs Unix", allow_module_level=True)
-
 from support.faults import (
     Faults,
     content,
@@ -35,6 +31,7 @@ ALL = os.environ.get("FAULTS") == "all"
 PARTS = range(8 if ALL else 1)  # the workers share them
 KILLS = 8 if ALL else 2  # kills in each part
 pytestmark = [
+    pytest.mark.unix,
     pytest.mark.slow,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc"),
     pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning"),

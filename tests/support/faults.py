@@ -5,7 +5,6 @@ python -m support.faults FOLDER CALL WORDS...    # runs a command that is killed
 
 import contextlib
 import errno
-import fcntl
 import io
 import json
 import os
@@ -45,6 +44,8 @@ class Faults(contextlib.ExitStack):
         self.calls = []
 
     def __enter__(self):
+        import fcntl  # only on Unix; what else is here is also for other systems
+
         for module, name in ((os, "mkdir"), (os, "unlink"), (os, "remove"), (os, "rmdir")):
             self._fail(module, name, lambda path, *_, dir_fd=None, **__: _place(path, dir_fd))
         self._fail(os, "replace", lambda _, path, **__: path)

@@ -2,7 +2,6 @@
 exits with the signal's status, and the same command then gives the result of an undisturbed one.
 """
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,10 +9,6 @@ import time
 from subprocess import PIPE
 
 import pytest
-
-if not hasattr(os, "fork"):
-    pytest.skip("needs Unix", allow_module_level=True)
-
 from support.faults import content
 from support.runs import SETTINGS
 
@@ -21,7 +16,7 @@ from pp_cl.config import run_config
 from pp_cl.files.run_folder import RunFolder
 from pp_studio.export.result import begin_result
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.unix, pytest.mark.slow]
 LATEST = 5  # seconds from a signal to the end of the process
 MOMENTS = 20
 STAGES = ("train", "eval", "export", "render")
