@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from support.guarded import DATA, GuardedDevice, TracedDevice
-from support.runs import Runs
+from support.runs import SPECULAR_STEPS, Runs
 
 from pp_cl import drivers
 from pp_cl.drivers import open_device
@@ -89,7 +89,7 @@ def small_work():
         patch.setattr(hull, "COMPARED_POINTS", 8000)
         patch.setitem(QUALITIES, QUICK, (40, 0.0))
         patch.setattr(texture, "SIDE", 256)
-        patch.setattr(specular, "STEPS", 8)
+        patch.setattr(specular, "STEPS", SPECULAR_STEPS)
         yield
 
 

@@ -16,9 +16,10 @@ from unittest.mock import patch
 from zipfile import BadZipFile
 
 from support.checkpoints import load_checkpoint
-from support.runs import spoken
+from support.runs import SPECULAR_STEPS, spoken
 
 from pp_cl.cli import program
+from pp_cl.engine.training import specular
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import read_row
@@ -196,5 +197,6 @@ def differences(run, expected):
 
 
 if __name__ == "__main__":
+    specular.STEPS = SPECULAR_STEPS
     with Faults(sys.argv[1], int(sys.argv[2]), 0):
         sys.exit(program(sys.argv[3:]))

@@ -29,6 +29,8 @@ SETTINGS = {
     "train.prune_weight": 0.5,
 }
 
+SPECULAR_STEPS = 8  # of a specular layer's fit in tests, and in the processes that they kill
+
 
 def arguments(scene, out, downscale=2, **changes):
     """Command line of a small training."""
