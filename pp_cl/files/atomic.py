@@ -4,6 +4,7 @@ files that it wrote there, and it replaces and removes no others.
 
 import errno
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -297,8 +298,12 @@ def sha256_of(file: Path) -> Any:
 
 
 def remove_leftovers(folder: Path | str) -> None:
-    """Delete temporary files and folders that killed processes left in the folder and below it."""
-    for leftover in list(Path(folder).rglob(".*.pp-cl.tmp*")):
+    """Delete temporary files and folders that killed processes left in the folder and below it, and
+    those beside it with which check_target() tried whether it can be made.
+    """
+    place = Path(os.path.abspath(folder))
+    beside = place.parent.glob(f".{glob.escape(place.name)}.*.pp-cl.tmp")
+    for leftover in [*place.rglob(".*.pp-cl.tmp*"), *beside]:
         named = TEMPORARY.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):
             continue

@@ -170,7 +170,10 @@ def test_a_folder_becomes_ours_only_where_nothing_would_be_lost(tmp_path):
     with pytest.raises(UserError, match=r"a\.txt: pp-cl did not write this"):
         own(foreign, [foreign / "a.txt"])
     assert not is_owned(foreign) and len(list(foreign.iterdir())) == 2
+    tried = tmp_path / f".foreign.{DEAD}.pp-cl.tmp"  # by a process that could not remove it
+    tried.touch()
     own(foreign, [foreign / "b.txt"])
+    assert not tried.exists()
     assert is_owned(foreign) and {p.name for p in foreign.iterdir()} == {"a.txt", MANIFEST}
     write_text(foreign / "b.txt", "ours")
     own(foreign, [foreign / "b.txt"], alone=True)
