@@ -299,11 +299,11 @@ def sha256_of(file: Path) -> Any:
 
 def remove_leftovers(folder: Path | str) -> None:
     """Delete temporary files and folders that killed processes left in the folder and below it, and
-    those beside it with which check_target() tried whether it can be made.
+    the files beside it with which check_target() tried whether it can be made.
     """
     place = Path(os.path.abspath(folder))
-    beside = place.parent.glob(f".{glob.escape(place.name)}.*.pp-cl.tmp")
-    for leftover in [*place.rglob(".*.pp-cl.tmp*"), *beside]:
+    tried = place.parent.glob(f".{glob.escape(place.name)}.[0-9]*.pp-cl.tmp")
+    for leftover in [*place.rglob(".*.pp-cl.tmp*"), *filter(Path.is_file, tried)]:
         named = TEMPORARY.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):
             continue
