@@ -1,4 +1,5 @@
 // Training data of the specular layer (layers/specular.h): pixels of all views, drawn in any order.
+// They are stored as half, so that twice as many fit into the memory.
 #include "layers/specular.h"
 
 #define ROW (CHANNELS + 9)  // features, direction, place and residual of a pixel
@@ -23,24 +24,24 @@ kernel void specular_rows(
     global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
     global const float *image,               // (H, W, 3)
     global const float *target,              // (?, target_width, 3)
-    global float *rows)                      // (ROWS, ROW)
+    global half *rows)                       // (ROWS, ROW)
 {
     const uint i = get_global_id(0);
     if (i >= m) return;
     const uint pixel = chosen[i], x = pixel % width, y = pixel / width;
     const Camera cam = camera_load(camera);
-    global float *row = rows + ROW * ((size_t)first + i);
+    global half *row = rows + ROW * ((size_t)first + i);
     for (int c = 0; c < CHANNELS; c++)
-        row[c] = features[(size_t)CHANNELS * pixel + c];
+        vstore_half(features[(size_t)CHANNELS * pixel + c], c, row);
     const float3 direction = direction_of(&cam, x, y, side);
-    vstore3(direction, 0, row + CHANNELS);
+    vstore_half3(direction, 0, row + CHANNELS);
     const uint begin = pixel_offset[pixel], end = pixel_offset[pixel + 1];
     const float3 place =
         place_of(&cam, direction, begin, end, pair_key, pixel_weight_point, extent);
-    vstore3(place, 0, row + CHANNELS + 3);
+    vstore_half3(place, 0, row + CHANNELS + 3);
     const float3 wanted = vload3((size_t)target_width * (y - top) + x - left, target);
     const float alpha = 1.0f - transmittance[pixel];
-    vstore3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 6);
+    vstore_half3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 6);
 }
 
 // One work-item per pixel of a batch: writes the layer's inputs, and the output that it should give.
@@ -48,21 +49,24 @@ kernel void specular_batch(
     const uint n,
     const float unit,          // of the residuals
     global const uint *drawn,  // (n) rows
-    global const float *rows,  // (ROWS, ROW)
+    global const half *rows,   // (ROWS, ROW)
     global float *inputs,      // (?, ?, INPUTS) n in all
     global float *wanted)      // (?, ?, 3)
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
-    global const float *row = rows + ROW * (size_t)drawn[i];
+    global const half *row = rows + ROW * (size_t)drawn[i];
     global float *input = inputs + INPUTS * (size_t)i;
     for (int c = 0; c < CHANNELS; c++)
-        input[c] = row[c];
-    global const float *direction = row + CHANNELS, *place = direction + 3, *residual = place + 3;
+        input[c] = vload_half(c, row);
+    float values[9];  // direction, place, residual
+    for (int k = 0; k < 9; k++)
+        values[k] = vload_half(CHANNELS + k, row);
+    const float *direction = values, *place = values + 3;
     global float *encoded = input + CHANNELS;
     ENCODE(float, direction, OCTAVES, encoded)
     ENCODE(float, place, PLACE_OCTAVES, (encoded + DIRECTION_INPUTS))
-    vstore3(0.5f + vload3(0, residual) / unit, i, wanted);
+    vstore3(0.5f + vload3(2, values) / unit, i, wanted);
 }
 
 // One work-item per value: writes the gradient of the mean square of image - wanted.

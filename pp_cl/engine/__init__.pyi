@@ -13,6 +13,7 @@ from .step import Trainer as Trainer
 from .training.crops import Crop as Crop
 from .training.crops import Crops as Crops
 from .training.specular import SpecularFit as SpecularFit
+from .training.specular import fit_steps as fit_steps
 from .training.target import Target as Target
 from .views import MIN_SIDE as MIN_SIDE
 from .views import View as View

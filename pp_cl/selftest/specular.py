@@ -18,6 +18,7 @@ from pp_cl.reference import network
 from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
 BOUND = 2e-6  # sums of up to 58 products; errors of the double-angle formulas add up
+HALF, LEAST = 2**-11 + 8 * EPS, 2**-14  # rounding to half, and the least half that has all bits
 EXTENT = 1.7  # world units
 WEIGHTS, FAR = (0.01, 0.9), (1.0, 9.0)  # blend weights and distances of fragments
 PADDED = 2, 1  # (left, top) of an image within the rendered one
@@ -107,7 +108,8 @@ def _forward(dev, rng):
 def _batches(dev, rng):
     """The pixels kept from two views, batches of them, and a step's gradient."""
     for n in SIZES:
-        rows, expected = dev.zeros((2 * n + 1, ROW)), np.zeros((2 * n + 1, ROW))
+        rows = dev.zeros((2 * n + 1, ROW), np.float16)
+        expected = np.zeros(rows.shape)
         for first, side in ((0, 1), (n + 1, 2)):
             view, *rays = _view(dev, rng, n + 3, 9, side)
             left, top = PADDED
@@ -123,7 +125,7 @@ def _batches(dev, rng):
             expected[first : first + n] = np.concatenate(of_pixels, -1)
         stored = rows.get()
         usable = np.isfinite(expected).all(1)
-        yield each(stored[usable], expected[usable], 8 * EPS, floor=EPS)
+        yield each(stored[usable], expected[usable], HALF, floor=LEAST)
         kept = np.where(usable[:, None], stored, 0)
         drawn, unit = rng.integers(0, len(kept), n).astype(np.uint32), 0.3
         inputs, wanted = dev.empty((n, 1, INPUTS)), dev.empty((n, 1, 3))

@@ -4,6 +4,7 @@ import statistics
 from collections import deque
 
 from pp_cl.engine.training.schedule import refine_steps, supersampling_at
+from pp_cl.engine.training.specular import fit_steps
 from pp_cl.session.plan import Plan
 from pp_cl.settings import Config
 
@@ -15,16 +16,18 @@ FOG = 0.35
 # of 1,160 steps, 33.1 and 32.7.
 FIRST_REFINED = 1000
 # With fewer steps than this after the first refinement, it is better without the second: in 8
-# minutes, 1,270 steps of `full`, lego reaches 31.5 dB with both and 33.5 with one; in 16 minutes,
-# 3,000 steps, 34.4 and 35.0. By these, both would be equal after 30 to 40 minutes. The second is
-# judged once the first is made: until then, images are small and steps cheap if it is to come.
-FURTHER_REFINED = 6000
+# minutes, 1,270 steps of `full`, lego reaches 31.6 dB with both and 33.5 with one; in 16 minutes,
+# 3,000 steps, 34.4 and 35.0; in 28 minutes, 10,000 steps, 35.7 and 35.5: in between, both are equal
+# at 7,500. The second is judged once the first is made: until then, images are small and steps
+# cheap if it is to come.
+FURTHER_REFINED = 7500
 # A step without a refinement takes this many times as long as one on halved images: a guess, which
 # the next plan corrects.
 WHOLE = 1.5
 # The end looks at all training views. For as many pixels as a step has, this takes ENDING of a
-# step's time, and the specular layer adds LOOKING. FITTING: seconds of that layer's fit.
-ENDING, LOOKING, FITTING = 0.15, 0.3, 4.0
+# step's time, and the specular layer adds LOOKING. FITTING: seconds of a step of that layer's fit,
+# with its folds.
+ENDING, LOOKING, FITTING = 0.15, 0.3, 1 / 150
 FEWEST, MOST = 10, 100  # last steps whose median time counts: the first may build kernels
 
 
@@ -38,7 +41,7 @@ class Budget:
         is_fitted = train.specular == "auto"
         share = ENDING + LOOKING * is_fitted
         self._ending = share * pixels / train.crop**2 if train.crop else 0.0  # steps
-        self._fitting = FITTING * is_fitted
+        self._fitting = FITTING * is_fitted  # seconds a step
         self._times: deque[float] = deque(maxlen=MOST)
         self._last = self._next = 0.0  # seconds: end of the last step, time of the next plan
 
@@ -56,7 +59,7 @@ class Budget:
             return None
         time_given = 60 * train.minutes / train.members
         self._next = seconds + time_given / PLANS
-        time_left = time_given - seconds - self._fitting
+        time_left = time_given - seconds - self._fitting * fit_steps(train.iterations)
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
         time_left /= clearing * statistics.median(self._times)
         given, refined = Plan.given(config), refine_steps(train)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from pp_cl.config import AUTOMATIC
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.render import is_supersampled
 from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.scene.hull import Hull, spacing_pixels
@@ -54,6 +55,8 @@ class Plan:
         is_open = given.refine_at == UNSET, given.radius == 0, given.view_opacity == "auto"
         automatic = tuple(key for key, is_auto in zip(AUTOMATIC, is_open, strict=True) if is_auto)
         plan = replace(given, refine_at=refine_at, automatic=automatic)
+        if not is_supersampled(config.raster):
+            plan = plan.with_one_sample()
         if "train.view_opacity" in automatic:
             plan = replace(plan, view_opacity="off" if agreement.forgiven else "on")
         return plan.for_grid(config.train, hull.grid, agreement.views)
@@ -87,7 +90,7 @@ class Plan:
         radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
         return replace(self, radius=radius)
 
-    def for_memory(self) -> "Plan":
+    def with_one_sample(self) -> "Plan":
         """A plan without supersampling."""
         return replace(self, supersampled=0.0)
 

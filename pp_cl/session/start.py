@@ -138,7 +138,7 @@ def fitting_hull(
         of_hull = hull.grid, len(hull.ids), depth_range(views, hull)
         fault = memory_plan.fault_of(*of_hull)
         if fault and plan.supersampled > 0:
-            plan = plan.for_memory()
+            plan = plan.with_one_sample()
             memory_plan.follow(plan.settings(config))
             given_up.append(f"features: of one sample a pixel in the end ({fault[0]})")
             fault = memory_plan.fault_of(*of_hull)

@@ -190,7 +190,7 @@ class Training:
         count, step = model.cloud.count, trainer.step
         may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
         if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
-            self._follow(Plan.given(self.config).for_memory())
+            self._follow(Plan.given(self.config).with_one_sample())
             message = f"step {step}: for lack of memory, features are of one sample a pixel"
             warnings.warn(message, stacklevel=2)
         try:

@@ -35,6 +35,7 @@ from pp_cl.engine import (
     Target,
     Trainer,
     evenly,
+    fit_steps,
 )
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
@@ -239,7 +240,8 @@ def _fit_specular(run, gaussians):
         return targets.crop(views[i], (0, 0, camera.width, camera.height))[0]
 
     drawn, seed = drawn_by(run, gaussians), run.config.train.seed
-    layer = SpecularFit(drawn.renderer, views, target, run.gamma, seed).fitted().layer
+    fit = SpecularFit(drawn.renderer, views, target, run.gamma, seed)
+    layer = fit.fitted(fit_steps(run.config.train.iterations)).layer
     parameters = layer.parameters if layer else {}
     return {name: run.dev.download(array) for name, array in parameters.items()}
 

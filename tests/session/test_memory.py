@@ -118,6 +118,13 @@ def test_what_was_to_be_supersampled_is_given_up_before_points(
     assert load(folder.path).renderer.supersampling == 1
 
 
+def test_only_flat_discs_by_alpha_are_planned_with_samples(tmp_path):
+    """A softmax has one sample a pixel anyhow, so nothing is counted for four or given up."""
+    folder, scene = RunFolder(tmp_path / "run"), write_ball_scene(tmp_path / "ball")
+    assert main(arguments(scene, folder.path, train__iterations=2, raster__blend="softmax")) == 0
+    assert load_config(folder.config).train.supersampled == 0
+
+
 def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
     config = preset(base)
     settings = {"network.widths": "16,16,16", "raster.radius": "0.85"} | changes

@@ -29,7 +29,7 @@ SETTINGS = {
     "train.prune_weight": 0.5,
 }
 
-SPECULAR_STEPS = 8  # of a specular layer's fit in tests, and in the processes that they kill
+SPECULAR_STEPS = 8, 8  # of a specular layer's fit in tests, and in the processes that they kill
 
 
 def arguments(scene, out, downscale=2, **changes):

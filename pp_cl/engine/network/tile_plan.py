@@ -36,8 +36,8 @@ from pp_cl.engine.layers.tiles import (
 )
 from pp_cl.engine.network.layers import Layer, convolutions, gradient_of, levels_of
 
-# How far the loss reaches, in pixels: from a target's pixel to the gradients that depend on it,
-# through two SSIM windows; and, together with the network, from the image's border.
+# How far the loss reaches, in pixels: from a pixel of the image or target to the gradients that
+# depend on it, through two SSIM windows; and, together with the network, from the image's border.
 LOSS_RADIUS, LOSS_BORDER = 10, 48
 
 
@@ -244,7 +244,7 @@ def plan_forward(
     device, until it is given others.
     """
     radius, last = receptive_radius(layers), layers[-1].name
-    affected = grow(active, _tiles_of(radius[last]))
+    affected = grow(active, _tiles_of(radius[last] + LOSS_RADIUS))
     del radius["x"]  # the caller gives x
     maps = _map_all(layers, size, active, radius)
     count = {c.name: c.multiplications(*size) for c in convolutions(layers)}

@@ -20,7 +20,7 @@ from pp_cl.engine.training.schedule import (
     supersampling_at,
 )
 from pp_cl.engine.training.smooth import Smoother
-from pp_cl.engine.training.specular import SpecularFit
+from pp_cl.engine.training.specular import SpecularFit, fit_steps
 from pp_cl.engine.training.state import split_opacity
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def fit_specular(trainer: Trainer) -> None:
         return whole_target(trainer, index)
 
     fit = SpecularFit(trainer.renderer, trainer.views, target, trainer.gamma, train.seed)
-    trainer.fitted = fit.fitted()
+    trainer.fitted = fit.fitted(fit_steps(train.iterations))
     trainer.model.specular = trainer.fitted.layer
 
 

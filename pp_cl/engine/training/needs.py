@@ -18,7 +18,7 @@ from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud, sh_blocks
 from pp_cl.engine.raster.project import footprint_pixels
-from pp_cl.engine.render import is_supersampled, point_radius, view_table
+from pp_cl.engine.render import point_radius, view_table
 from pp_cl.engine.training.crops import crop_side
 from pp_cl.engine.training.depth_loss import depth_loss_table
 from pp_cl.engine.training.loss import loss_table
@@ -98,7 +98,7 @@ class Needs:
         downscale, halvings = config.scene.downscale, stretch.refinements
         crop = self._padded_size(downscale << halvings, crop_side(train.crop, halvings))
         image = self._padded_size(downscale, 0)
-        side, pixels = stretch.supersampling if is_supersampled(raster) else 1, math.prod(image)
+        side, pixels = stretch.supersampling, math.prod(image)
         pairs, plain = (
             grown(0, round(n * min(footprint_pixels(radius, k), pixels))) for k in (side, 1)
         )

@@ -21,11 +21,11 @@ from pp_cl.engine.views import View, evenly
 
 KERNELS = "training/specular"
 SIDE = 64  # a batch has SIDE x SIDE pixels
-ROW = 25  # floats stored for a pixel: features, direction, place, colours
-MOST_VIEWS, MOST_ROWS = 128, 2**18  # views rendered for the fit; pixels kept from all of them
+ROW = 25  # values stored for a pixel: features, direction, place, residual
+MOST_VIEWS, MOST_ROWS = 128, 2**19  # views rendered for the fit; pixels kept from all of them
 LEAST_ALPHA = 0.5  # pixels below this alpha are not fitted to
 RATE = 5e-3  # first learning rate; it falls to 0 along a cosine
-STEPS = 600  # a fold takes half of them; longer fits adapt to single views
+STEPS = 600, 1500  # of a fit, at least and at most; a fold takes half of them
 FOLDS = 3
 LEAST_SCALE = 0.2  # a layer scaled by less than this is dropped
 
@@ -42,11 +42,18 @@ class Fitted(NamedTuple):
     after: float
 
 
+def fit_steps(iterations: int) -> int:
+    """How many steps the fit takes after a training of this many steps: a fifth of them, within
+    STEPS, so that the fit takes a few percent of the training's time.
+    """
+    return min(max(iterations // 5, STEPS[0]), STEPS[1])
+
+
 def fit_table(dev: Device, pixels: int) -> Table:
     """The buffers of SpecularFit. pixels: the number of pixels of all views together."""
-    image, most = ((SIDE, SIDE, 3), np.float32), dev.info["max_allocation_bytes"] // (4 * ROW)
+    image, most = ((SIDE, SIDE, 3), np.float32), dev.info["max_allocation_bytes"] // (2 * ROW)
     return {
-        "rows": ((min(MOST_ROWS, pixels, most), ROW), np.float32),
+        "rows": ((min(MOST_ROWS, pixels, most), ROW), np.float16),
         "drawn": ((SIDE * SIDE,), np.uint32),
         "inputs": ((SIDE, SIDE, INPUTS), np.float32),
         "wanted": image,
@@ -88,25 +95,25 @@ class SpecularFit:
             counts.append(len(chosen))
             del rendered  # else its arrays would stay beside the larger ones of the next view
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
-        lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
+        lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:].astype(np.float32)
         self._before = float(np.mean(lacking**2, dtype=np.float64)) if len(lacking) else 0.0
         # the layer learns residuals in this unit, so that Adam's steps have the right size
         self._unit = 2 * math.sqrt(self._before)
 
-    def fitted(self) -> Fitted:
-        """The layer, scaled by the largest factor up to 1 that does not lose, in cross-validation,
-        on views left out of the fit: twice the best one. Even these views have been trained on, so
-        new ones lack more.
+    def fitted(self, steps: int) -> Fitted:
+        """The layer, fitted in this many steps and scaled by the largest factor up to 1 that does
+        not lose, in cross-validation, on views left out of the fit: twice the best one. Even these
+        views have been trained on, so new ones lack more.
         """
         every, sums = np.arange(len(self._fold), dtype=np.uint32), np.zeros(2)
         for fold in range(FOLDS):
             is_out = self._fold == fold
             if is_out.any() and not is_out.all():
-                sums += self._products(self._trained(every[~is_out], STEPS // 2), every[is_out])
+                sums += self._products(self._trained(every[~is_out], steps // 2), every[is_out])
         scale = min(1.0, max(0.0, 2 * float(sums[0] / sums[1]))) if sums[1] > 0 else 0.0
         if scale < LEAST_SCALE:
             return Fitted(None, scale, self._before, self._before)
-        layer = self._trained(every, STEPS)
+        layer = self._trained(every, steps)
         rp, pp = self._products(layer, every) / (3 * len(every))
         layer.scale(scale * self._unit)
         after = self._before - 2 * scale * rp + scale**2 * pp

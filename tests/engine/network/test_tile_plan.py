@@ -144,6 +144,14 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
         assert far <= radius[name] <= far + 3, name
 
 
+def test_the_backward_pass_starts_where_the_loss_sees_a_change(dev, always):
+    net, active = UNet(dev, (16, 16, 16)), np.zeros((37, 45), bool)
+    active[18, 22] = True
+    plan = net.plan_tiles(SIZE, active, gradient_tiles=np.zeros_like(active))
+    away = np.abs(np.argwhere(~plan.active) - (18, 22)).max(1)  # of the tiles that are left out
+    assert 4 * (away.min() - 1) >= receptive_radius(net.layers)["out"] + LOSS_RADIUS
+
+
 def test_the_loss_sees_the_border_no_further():
     """The margin that is compared tile by tile covers the reach of the forward pass and of the
     SSIM's gradient.

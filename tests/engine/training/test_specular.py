@@ -18,7 +18,7 @@ from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.network import network
 from pp_cl.settings import RasterConfig
 
-GAMMA = 0.03
+GAMMA, STEPS = 0.03, 200
 LIGHT = np.array([-0.8, 0.0, -0.6])
 
 
@@ -48,20 +48,15 @@ class Shown:
         return rendered.dev.upload(rendered.cropped(rendered.image.get()) + missing, np.float32)
 
     def fitted(self, seed=0):
-        return SpecularFit(self.renderer, self.views, self.target, GAMMA, seed).fitted()
+        return SpecularFit(self.renderer, self.views, self.target, GAMMA, seed).fitted(STEPS)
 
 
 def lobe(index, camera):
     return 0.3 * np.maximum(directions(camera) @ LIGHT, 0)[..., None] ** 4 * [1.0, 0.8, 0.5]
 
 
-@pytest.fixture
-def enough(monkeypatch):
-    monkeypatch.setattr(specular, "STEPS", 200)
-
-
 @pytest.mark.large
-def test_a_lobe_is_found_and_shown(dev, rng, enough):
+def test_a_lobe_is_found_and_shown(dev, rng):
     shown = Shown(dev, rng, 9, lobe)
     fitted = shown.fitted()
     assert fitted.scale > 0.9
@@ -79,14 +74,14 @@ def test_a_lobe_is_found_and_shown(dev, rng, enough):
 
 
 @pytest.mark.large
-def test_the_same_seed_gives_the_same_layer(dev, rng, enough):
+def test_the_same_seed_gives_the_same_layer(dev, rng):
     shown = Shown(dev, rng, 9, lobe)
     layers = [shown.fitted(seed).layer.all_parameters.get() for seed in (0, 0, 1)]
     assert (layers[0] == layers[1]).all() and (layers[0] != layers[2]).any()
 
 
 @pytest.mark.large
-def test_what_other_views_contradict_is_left_out(dev, rng, enough):
+def test_what_other_views_contradict_is_left_out(dev, rng):
     noise = rng.normal(size=(9, 3)) * 0.1
     noise -= noise.mean(axis=0)
     fitted = Shown(dev, rng, 9, lambda index, _: noise[index]).fitted()
@@ -97,13 +92,13 @@ def test_what_other_views_contradict_is_left_out(dev, rng, enough):
 @pytest.mark.parametrize(
     "views, lacking", [(1, lobe), (4, lambda *_: np.zeros(3))], ids=["one view", "nothing"]
 )
-def test_without_anything_to_tell_there_is_none(dev, rng, enough, views, lacking):
+def test_without_anything_to_tell_there_is_none(dev, rng, views, lacking):
     fitted = Shown(dev, rng, views, lacking).fitted()
     assert fitted.layer is None and fitted.scale == 0 and np.isfinite(fitted.before)
 
 
 @pytest.mark.large
-def test_views_that_lack_the_same_get_it(dev, rng, enough):
+def test_views_that_lack_the_same_get_it(dev, rng):
     fitted = Shown(dev, rng, 4, lambda *_: np.full(3, 0.1)).fitted()
     assert fitted.scale > 0.95 and fitted.after < 0.01 * fitted.before
 
@@ -131,7 +126,7 @@ def test_its_gradient_is_that_of_finite_differences(dev, rng):
 # ---- in trainings
 
 
-def test_ignored_pixels_are_not_looked_at(dev, rng, enough):
+def test_ignored_pixels_are_not_looked_at(dev, rng):
     shown = Shown(dev, rng, 4, lobe)
     for view in shown.views:
         object.__setattr__(view, "ignored", np.ones((36, 36), bool))
@@ -170,7 +165,7 @@ def test_a_kill_within_the_fit_resumes_to_the_same_bytes(scene, tmp_path, always
     assert checkpoint(whole) == checkpoint(killed)
 
 
-def interrupted(_):
+def interrupted(*_):
     raise KeyboardInterrupt
 
 
