@@ -334,8 +334,11 @@ def scene_config(scene: str, preset_name: str, given: Iterable[Given] = ()) -> C
 def _resumed(folder, stored, scene, given):
     """The settings of a run with a checkpoint: FREE may change, and LENGTH if it is finished."""
     from pp_cl.checkpoint import opened_run
+    from pp_cl.engine.render import is_supersampled
 
     config, free = configure(load_config(folder.config), scene, given), {*FREE}
+    if not is_supersampled(config.raster):  # the setting has no effect, and the run has stored 0
+        config.train.supersampled = stored.train.supersampled
     if stored.train.minutes:  # the run has planned these, as it did train.iterations
         config.train.refine_at = stored.train.refine_at
         config.train.supersampled = stored.train.supersampled

@@ -1,5 +1,5 @@
 // Training data of the specular layer (layers/specular.h): pixels of all views, drawn in any order.
-// They are stored as half, so that twice as many fit into the memory.
+// They are stored as half, which halves their memory.
 #include "layers/specular.h"
 
 #define ROW (CHANNELS + 9)  // features, direction, place and residual of a pixel

@@ -37,11 +37,8 @@ def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0):
             config = plan.settings(config)
             train = config.train
         assert [at for at in refine_steps(train) if at <= step] == refined
-    return (
-        total + FITTING * fit_steps(train.iterations) + 53 * seconds_of(1.0, len(refined)),
-        train,
-        refined,
-    )
+    total += FITTING * fit_steps(train.iterations) + 53 * seconds_of(1.0, len(refined))
+    return total, train, refined
 
 
 @pytest.mark.parametrize("minutes, supersampled", [(1, 0), (1, 0.3), (5, 0), (60, 0), (60, 0.3)])

@@ -12,7 +12,7 @@ from pp_cl.cli import main
 from pp_cl.engine.network.specular import INPUTS, Specular
 from pp_cl.engine.render import Renderer
 from pp_cl.engine.training import specular
-from pp_cl.engine.training.specular import SpecularFit, gradient_of_squares
+from pp_cl.engine.training.specular import SpecularFit, fit_steps, gradient_of_squares
 from pp_cl.engine.views import View
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.network import network
@@ -101,6 +101,11 @@ def test_without_anything_to_tell_there_is_none(dev, rng, views, lacking):
 def test_views_that_lack_the_same_get_it(dev, rng):
     fitted = Shown(dev, rng, 4, lambda *_: np.full(3, 0.1)).fitted()
     assert fitted.scale > 0.95 and fitted.after < 0.01 * fitted.before
+
+
+def test_longer_trainings_get_longer_fits(monkeypatch):
+    monkeypatch.setattr(specular, "STEPS", (600, 1500))
+    assert [fit_steps(n) for n in (20, 6000, 22000)] == [600, 1200, 1500]
 
 
 def test_its_gradient_is_that_of_finite_differences(dev, rng):
