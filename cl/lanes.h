@@ -28,10 +28,14 @@
 #include "gpu/lanes.h"
 #endif
 
+#ifndef ON_CPU
+#define ON_CPU (LANES == 16)  // given where lanes are the samples of a pixel
+#endif
+
 // Steps of a walk whose reads do not wait for each other: 4 on GPUs, where a read takes hundreds of
 // cycles, 1 on CPUs.
 #ifndef BATCH
-#define BATCH (LANES == 16 ? 1 : 4)
+#define BATCH (ON_CPU ? 1 : 4)
 #endif
 
 // Asks for what lies at a global address before it is read, on CPUs, where walks over fragments and
@@ -39,8 +43,7 @@
 // A simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
 #define FRAGMENTS_AHEAD 32
 #define POINTS_AHEAD 8
-#if (LANES == 16 || defined(ON_CPU)) && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) &&     \
-    defined(__has_builtin)
+#if ON_CPU && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
 // through a number, since its argument is a pointer to private memory
 #define READ_AHEAD(address) __builtin_prefetch((const void *)(uintptr_t)(address))

@@ -7,8 +7,7 @@
 // footprints_cover()  whether they cover a pixel (px, py) each, with d and depth
 //
 // Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray
-// meets the surface for which a point stands, and constants of blending and shading; where points
-// learn offsets, also the gradients of these for blend.cl.
+// meets the surface for which a point stands, and constants of blending and shading.
 //
 // Counting (project.cl) and filling (pairs.cl) must find the same fragments, so no compiler may
 // round here in one way and there in another: FP_CONTRACT is OFF in what leads to a fragment.
@@ -58,6 +57,14 @@
 // pixel's centre, because the farthest point of a pixel is sqrt(1/2) away (Pulsar: 1.5 half
 // pixels).
 #define LEAST_RADIUS 0.75f
+
+// 1 / a to half an ulp, by a step of Newton's: a GPU's division may be off by 2.5, which shifts all
+// rays. Near its rim, a sphere's weight is a small difference of lengths times up to exp(1 /
+// gamma).
+static inline float reciprocal(const float a) {
+    const float nearly = 1.0f / a;
+    return nearly + nearly * fma(-a, nearly, 1.0f);
+}
 
 // The width of a pixel at range t is t divided by this: the smaller focal length has the wider
 // pixels.

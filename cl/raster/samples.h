@@ -1,6 +1,10 @@
-// Samples of a pixel, SIDE x SIDE of them in a grid, in LANES = SAMPLES lanes; and discs there.
+// Samples of a pixel, SIDE x SIDE of them in a grid, in LANES = SAMPLES lanes, and fragments there.
 #ifndef PP_SAMPLES_H
 #define PP_SAMPLES_H
+
+#ifndef LANES
+#define LANES 1  // SAMPLES
+#endif
 
 #include "common.h"
 #include "lanes.h"
@@ -25,13 +29,12 @@ ALWAYS_INLINE Rays rays_of(const Camera *cam, const uint q) {
     return m;
 }
 
-// The radius of a point's footprint, world units.
-ALWAYS_INLINE float
-reach_of(const Camera *cam, const float4 centre, global const float *point_shape, const uint i) {
-    return fmax(point_shape[(size_t)SHAPE * i], LEAST_RADIUS * centre.w / least_focal(cam));
+// The radius of a disc's footprint. c: its centre, and its distance from the eye.
+ALWAYS_INLINE float reach_of(const Camera *cam, const float4 c, const float radius) {
+    return fmax(radius, LEAST_RADIUS * c.w / least_focal(cam));
 }
 
-// A point's falloffs at the samples, 0 where it covers none: those of disc_covers().
+// A disc's falloffs at the samples, 0 where it covers none: those of disc_covers().
 ALWAYS_INLINE floats falloffs(const Rays *m, const float4 c, const float reach) {
 #pragma OPENCL FP_CONTRACT OFF
     const floats ex = c.y - c.z * m->y, ey = c.z * m->x - c.x, ez = c.x * m->y - c.y * m->x;
@@ -43,6 +46,30 @@ ALWAYS_INLINE floats falloffs(const Rays *m, const float4 c, const float reach) 
     const floats d = 1.0f;
 #endif
     return select((floats)(0.0f), d, covers);
+}
+
+typedef struct {
+    uint point;
+    floats falloff;
+} Fragment;
+
+// A pair's fragment, in the pixel with these rays. One sample's falloff is stored with the point,
+// those of several are computed again.
+ALWAYS_INLINE Fragment fragment_load(
+    const uint pair,
+    const Camera *cam,
+    const Rays *m,
+    global const float4 *point_camera,
+    global const float *point_shape,
+    global const uint *pair_point_falloff) {
+#if SAMPLES == 1
+    const uint2 stored = vload2(pair, pair_point_falloff);
+    return (Fragment){stored.x, as_float(stored.y)};
+#else
+    const uint point = pair_point_falloff[pair];
+    const float4 c = point_camera[point];
+    return (Fragment){point, falloffs(m, c, reach_of(cam, c, point_shape[(size_t)SHAPE * point]))};
+#endif
 }
 
 #endif

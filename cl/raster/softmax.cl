@@ -73,7 +73,7 @@ kernel void softmax_weights(
     global const uint2 *pair_point_falloff,  // (P, 2) point, bits of d
     global const float *opacity,             // (N)
     global ulong *pixel_weight_point,        // (P) weight << 32 | point, in the order of the keys
-    global float *pixel_derivative,          // (P) alike, NULL without DERIVATIVES
+    global float *pixel_derivative,          // (P, 1) alike, NULL without DERIVATIVES
     global uchar *point_is_visible)          // (N) 1: has a fragment that is not dropped
 {
     const uint q = get_global_id(0);

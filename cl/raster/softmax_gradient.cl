@@ -11,7 +11,7 @@ kernel void softmax_gradient(
     global const uint *pixel_offset,         // (HW+1)
     global const ulong *pair_key,            // (P) depth << 32 | pair
     global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    global const float *pixel_derivative,    // (P)
+    global const float *pixel_derivative,    // (P, 1)
     global const float16 *features,          // (H, W, 16) F
     global const float16 *grad_features,     // (H, W, 16) G
     global float2 *pair_gradient,            // (P, 2) b, s; cleared before

@@ -5,7 +5,7 @@
 // above S, is left alone. A pixel that is not opaque, or whose neighbour is not, has no such term.
 //
 // z = axis sum b t / (voxel_size sum b) of ranges t, so dz/db_i = axis (t_i - mean) / (voxel_size
-// sum b): blend.cl adds dL/db_i, its slope times t_i - mean, to G.f_i.
+// sum b): alpha.cl adds dL/db_i, its slope times t_i - mean, to G.f_i.
 #include "camera.h"
 #include "common.h"
 

@@ -114,7 +114,7 @@ class PulsarScene:
             self.capacity = pairs.capacity
         with dev.stage("weights"):
             opacity = self.point_opacity
-            weights = blend_weights(dev, b, pairs, camera, opacity, blend=blend, gamma=GAMMA)
+            weights = blend_weights(dev, b, points, pairs, opacity, blend=blend, gamma=GAMMA)
             weights.read_count(dev)
         with dev.stage("blend"):
             features = gather_rows(dev, self.device_features, weights.visible)
@@ -132,7 +132,6 @@ class PulsarScene:
                 dev,
                 self.buffers[blend],
                 *view,
-                opacity=opacity,
                 visible_features=result.visible_features,
                 features=result.features,
                 grad_features=self.grad,

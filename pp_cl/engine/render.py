@@ -298,15 +298,14 @@ class Renderer:
                 weights = blend_weights(
                     self.dev,
                     b,
+                    points,
                     pairs,
-                    points.camera_buffer,
                     points.point_opacity,
                     blend=settings.blend,
                     gamma=gamma if settings.blend == "softmax" else 1.0,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
-                    points=points,
                 )
                 weights.read_count(self.dev)
             tile_mask = None
@@ -341,10 +340,9 @@ class Renderer:
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
         alpha compositing also from dL/dalpha (H * W,), and from the distortion loss of each sample
-        times distortion_weight (cl/raster/blend.cl). depth_gradient: as for blend_backward().
-        with_offsets: also compute gradients of
-        offsets, if soft points or Gaussians are composited by alpha. max_weight: as for
-        blend_backward().
+        times distortion_weight (cl/raster/alpha.cl). with_offsets: also compute gradients of
+        offsets, if soft points or Gaussians are composited by alpha. depth_gradient, max_weight: as
+        for blend_backward().
 
         result: from the last forward(training=True). The gradients of the SH coefficients are those
         of the visible points' features times the basis functions in the view's direction; the
@@ -360,7 +358,6 @@ class Renderer:
                 result.points,
                 result.pairs,
                 result.weights,
-                opacity=result.points.point_opacity,
                 visible_features=result.visible_features,
                 features=result.features,
                 grad_features=grad_features,

@@ -131,9 +131,9 @@ class PairedPoints:
     ) -> np.ndarray:
         """(H, W, 16) blended features. rule: one of BLENDS. drops: max_tracked and early_stop."""
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
-        view = self.buffers, self.pairs, self.projected.camera_buffer
+        view = self.buffers, self.projected, self.pairs
         self.weights = blend_weights(
-            self.dev, *view, self.opacity, blend=rule, gamma=gamma, points=self.projected, **drops
+            self.dev, *view, self.opacity, blend=rule, gamma=gamma, **drops
         )
         self.weights.read_count(self.dev)
         visible = self.weights.visible.get()
@@ -177,7 +177,6 @@ class PairedPoints:
             self.dev,
             self.buffers,
             *view,
-            opacity=self.opacity,
             visible_features=self.visible_features,
             features=self.features,
             grad_features=self.dev.upload(grad_features, np.float32),

@@ -1,7 +1,7 @@
 // The hard disc of the paper: d = 1 everywhere.
 #include "raster/footprint/round.h"
 
-#define surface_range(range, shape, d) (range)
+#define surface_range(range, radius, d) (range)
 
 ALWAYS_INLINE Coverage
 footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {

@@ -61,14 +61,6 @@ typedef struct {
     float left, top;  // from the principal point to the centre of pixel (0, 0), pixels
 } Rim;
 
-// 1 / a to half an ulp, by a step of Newton's: a GPU's division may be off by 2.5, which shifts all
-// rays. Near its rim, a sphere's weight is a small difference of lengths times up to exp(1 /
-// gamma).
-static inline float reciprocal(const float a) {
-    const float nearly = 1.0f / a;
-    return nearly + nearly * fma(-a, nearly, 1.0f);
-}
-
 ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
 #pragma OPENCL FP_CONTRACT OFF
     Rim rim;

@@ -3,7 +3,7 @@
 #define PULSAR 1
 #include "raster/footprint/round.h"
 
-#define surface_range(range, shape, d) (range)
+#define surface_range(range, radius, d) (range)
 
 ALWAYS_INLINE Coverage
 footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {

@@ -12,12 +12,11 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import group_items, lanes, launch_groups, replayed, row_parts
-from pp_cl.engine.raster.footprint import FOOTPRINTS, footprint_macros
+from pp_cl.engine.device.launch import lanes, launch_groups, replayed, row_parts
+from pp_cl.engine.raster.footprint import FOOTPRINTS, footprint_macros, sample_macros
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, stored_degree
 from pp_cl.engine.raster.project import ProjectedPoints
-from pp_cl.engine.raster.samples import sampled_gradient, sampled_offsets
 from pp_cl.engine.raster.softmax import softmax_gradient
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
 
@@ -68,7 +67,7 @@ def blend_forward(
     """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32. b: keeps
     the recorded call, see replayed().
     """
-    dev.program("raster/blend", **_defines(dev)).launch(
+    dev.program("raster/blend", LANES=lanes(dev, ON_GPU)).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
@@ -125,7 +124,6 @@ def blend_backward(
     pairs: Pairs,
     weights: BlendWeights,
     *,
-    opacity: Array,
     visible_features: Array,
     features: Array,
     grad_features: Array,
@@ -137,15 +135,15 @@ def blend_backward(
 ) -> BlendGradients:
     """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
-    opacity: (N,). visible_features, features: from blend_forward(). grad_features: dL/dfeatures (H,
-    W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
-    sum_ij b_i b_j |z_i - z_j| of every sample to the loss, where b and z are the weights and depths
-    (world units) of its fragments; depths get no gradient. depth_gradient: (HW, 2), as
+    visible_features, features: from blend_forward(). grad_features: dL/dfeatures (H, W, 16).
+    grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times sum_ij
+    b_i b_j |z_i - z_j| of every sample to the loss, where b and z are the weights and depths (world
+    units) of its fragments; depths get no gradient. depth_gradient: (HW, 2), as
     engine/training/depth_loss.py writes it. voxel_size: the unit of offsets, in world units; 0:
-    offsets get no gradients. max_weight: (N,) float32, becomes for each point the
-    highest sum of its blend weights over an image's pixels so far. Raises ValueError if grad_alpha,
-    a distortion loss or depth_gradient is given with a softmax, and if offsets need gradients
-    without soft points or Gaussians composited by alpha.
+    offsets get no gradients. max_weight: (N,) float32, becomes for each point the highest sum of
+    its blend weights over an image's pixels so far. Raises ValueError if grad_alpha, a distortion
+    loss or depth_gradient is given with a softmax, and if offsets need gradients without soft
+    points or Gaussians composited by alpha.
     """
     is_alpha, moves = weights.blend == "alpha", voxel_size > 0
     has_depth = depth_gradient is not None
@@ -157,7 +155,8 @@ def blend_backward(
         )
     count = weights.total
     rows = len(visible_features), pairs.pixels, pairs.capacity
-    b.require(blend_backward_table(*rows, weights.blend, points.footprint, pairs.side))
+    kind = points.footprint, points.side
+    b.require(blend_backward_table(*rows, weights.blend, *kind))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
     of_fragments: dict[str, Any] = {
         "hw": pairs.pixels,
@@ -165,74 +164,69 @@ def blend_backward(
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
         "pixel_weight_point": weights.pixel_weight_point,
+        "pixel_derivative": weights.pixel_derivative,
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    options = {"DL_DB": int(not is_alpha), "MOVES": int(moves and pairs.side == 1)}
-    defines = _defines(dev, **options, **footprint_macros(points.footprint, pairs.side))
+    macros, of_samples = footprint_macros(*kind), sample_macros(dev, *kind)
     if is_alpha:
-        of_fragments |= {
-            "has_grad_alpha": int(grad_alpha is not None),
-            "distortion_weight": distortion_weight,
-            "point_slot": weights.point_slot,
-            "visible_features": visible_features,
-            "grad_alpha": grad_alpha,
-            "has_depth": int(has_depth),
-            "depth_gradient": depth_gradient,
-            "distortion": b.distortion,
-        }
-    if pairs.side > 1:
-        of_samples = weights.pixel_derivative, weights.sample_transmittance
-        sampled_gradient(dev, pairs, opacity, *of_samples, span=SPAN, **of_fragments)
-    elif is_alpha:
         launch_groups(
             dev,
-            "raster/blend",
+            "raster/alpha",
             "alpha_gradient",
             -(-pairs.pixels // SPAN),
             most=SPAN,
-            defines=defines,
-            pixel_derivative=weights.pixel_derivative,
-            transmittance=weights.transmittance,
+            defines=of_samples | {"SPAN": SPAN},
+            has_grad_alpha=int(grad_alpha is not None),
+            distortion_weight=distortion_weight,
+            sample_transmittance=weights.sample_transmittance,
+            opacity=weights.opacity,
+            point_slot=weights.point_slot,
+            visible_features=visible_features,
+            grad_alpha=grad_alpha,
+            has_depth=int(has_depth),
+            depth_gradient=depth_gradient,
+            distortion=b.distortion,
             **of_fragments,
         )
     else:
         softmax_gradient(
-            dev,
-            pairs.pixels,
-            features=features,
-            pixel_derivative=weights.pixel_derivative,
-            pixel_blend=b.pixel_blend,
-            **of_fragments,
+            dev, pairs.pixels, features=features, pixel_blend=b.pixel_blend, **of_fragments
         )
-    dev.program("raster/blend", **defines).launch(
+    of_points: dict[str, Any] = {
+        "s": count,
+        "visible": weights.visible_rows,
+        "point_offset": pairs.point_offset,
+        "pair_pixel": pairs.pair_pixel,
+        "pair_gradient": b.pair_gradient,
+    }
+    dev.program("raster/blend", DL_DB=int(not is_alpha), LANES=lanes(dev, ON_GPU), **macros).launch(
         "blend_backward",
         count * row_parts(dev, ON_GPU),
-        s=count,
-        voxel_size=voxel_size,
-        radius=points.radius,
         is_recorded=max_weight is not None,
-        visible=weights.visible_rows,
-        camera=points.camera_buffer,
-        point_camera=points.point_camera,
-        point_shape=points.point_shape,
-        cloud_offset=points.cloud_offset,
-        opacity=opacity,
-        pair_point_falloff=pairs.pair_point_falloff,
-        point_offset=pairs.point_offset,
-        pair_pixel=pairs.pair_pixel,
-        pair_gradient=b.pair_gradient,
         pixel_blend=None if is_alpha else b.pixel_blend,
         visible_features=visible_features,
         grad_features=grad_features,
         grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
-        grad_offset=b.grad_offset if moves else None,
         max_weight=max_weight,
+        **of_points,
     )
-    if moves and pairs.side > 1:
-        visible = weights.visible_rows, count
-        sampled_offsets(dev, points, pairs, *visible, opacity, voxel_size, b)
+    if moves:
+        dev.program("raster/offsets", **of_samples).launch(
+            "offset_gradient",
+            count,
+            voxel_size=voxel_size,
+            radius=points.radius,
+            camera=points.camera_buffer,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            cloud_offset=points.cloud_offset,
+            opacity=weights.opacity,
+            pair_point_falloff=pairs.pair_point_falloff,
+            grad_offset=b.grad_offset,
+            **of_points,
+        )
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,
@@ -240,8 +234,3 @@ def blend_backward(
         b.distortion if distortion_weight > 0 else None,
         b.pair_gradient,
     )
-
-
-def _defines(dev, **defines):
-    group = min(SPAN, group_items(dev))
-    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group} | defines

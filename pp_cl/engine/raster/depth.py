@@ -5,10 +5,9 @@ from __future__ import annotations
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.raster.footprint import footprint_macros
+from pp_cl.engine.raster.footprint import sample_macros
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints
-from pp_cl.engine.raster.samples import sample_macros
 from pp_cl.engine.raster.weights import BlendWeights
 
 
@@ -29,36 +28,20 @@ def depth_forward(
     distance of the nearest one, in world units.
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
-    if pairs.side > 1:
-        dev.program("raster/sampled_depth", **sample_macros(dev, pairs)).launch(
-            "sampled_depth",
-            pairs.pixels,
-            early_stop=weights.early_stop,
-            voxel_size=voxel_size,
-            camera=points.camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            hw=pairs.pixels,
-            pixel_offset=pairs.pixel_offset,
-            pair_key=pairs.pair_key,
-            pair_point=pairs.pair_point_falloff,
-            pixel_weight_point=weights.pixel_weight_point,
-            opacity=weights.opacity,
-            pixel_alpha=alpha,
-            pixel_depth=depth,
-            pixel_median=median,
-        )
-        return alpha, depth, median
-    dev.program("raster/depth", **footprint_macros(points.footprint)).launch(
+    dev.program("raster/depth", **sample_macros(dev, points.footprint, points.side)).launch(
         "depth_forward",
         pairs.pixels,
         hw=pairs.pixels,
+        early_stop=weights.early_stop,
+        voxel_size=voxel_size,
         camera=points.camera_buffer,
+        point_camera=points.point_camera,
         point_shape=points.point_shape,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
         pair_point_falloff=pairs.pair_point_falloff,
         pixel_weight_point=weights.pixel_weight_point,
+        opacity=weights.opacity,
         pixel_alpha=alpha,
         pixel_depth=depth,
         pixel_median=median,

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from pp_cl.engine.device.device import Device
+
 MOST_OFFSET = 0.5  # voxel sizes each way: keeps points in their cells, scales radii by 0.61 to 1.65
 MOST_OF_GAUSSIANS = 2.0  # in voxel sizes, logarithms or deviations
 MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: the largest that a .spz can hold
@@ -48,3 +50,8 @@ def footprint_macros(footprint: str, side: int = 1) -> dict[str, int | str]:
         "OFFSETS": kind.offsets,
         "SHAPE": kind.shape,
     }
+
+
+def sample_macros(dev: Device, footprint: str, side: int) -> dict[str, int | str]:
+    """The defines of a program whose lanes are the samples of a pixel, see cl/raster/samples.h."""
+    return footprint_macros(footprint, side) | {"LANES": side**2, "ON_CPU": int(dev.is_cpu)}

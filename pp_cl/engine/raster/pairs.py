@@ -32,22 +32,19 @@ class Pairs:
     The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
     other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
 
-    footprint: the points' footprint, one of FOOTPRINTS. side: samples of a pixel, each way. count:
-    the number of pairs, downloaded by read_count(). point_offset: (N+1,) uint32, point i owns pairs
-    point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1,) uint32, pixel q owns keys
+    count: the number of pairs, downloaded by read_count(). point_offset: (N+1,) uint32, point i
+    owns pairs point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1,) uint32, pixel q owns keys
     pixel_offset[q] to pixel_offset[q+1]. pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P,
     2) uint32, the point, and the bits of the falloff d of Eq. (1); if a pixel has several samples,
     (P, 1), only the point. pair_key: (P,) uint64, depth bits << 32 | pair, sorted within each pixel
     by depth, then by point.
     """
 
-    footprint: str
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
     pair_point_falloff: Array
     pair_key: Array
-    side: int = 1
     count: Any = None
 
     def read_count(self, dev: Device) -> None:
@@ -134,13 +131,11 @@ def find_pairs(
     else:
         _list_by_key(dev, b, pixels, capacity)
     return Pairs(
-        points.footprint,
         b.point_offset,
         b.pixel_offset,
         b.pair_pixel,
         b.pair_point_falloff,
         b.pair_key,
-        side,
     )
 
 

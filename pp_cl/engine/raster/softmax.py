@@ -3,16 +3,17 @@
 from typing import Any
 
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
 
 
 def softmax_weights(
-    dev: Device, pixels: int, gamma: float, defines: dict[str, Any], **arguments: Any
+    dev: Device, pixels: int, gamma: float, derivatives: bool, **arguments: Any
 ) -> None:
-    """Compute the blend weights of Eq. (1). gamma: depth sharpness. defines, arguments: those of
-    alpha_weights in weights.py, and the camera.
+    """Compute the blend weights of Eq. (1). gamma: depth sharpness. derivatives: write them.
+    arguments: the kernel's.
     """
-    drops = int(arguments["early_stop"] > 0)
-    dev.program("raster/softmax", DROPS=drops, **defines).launch(
+    macros = {"DROPS": int(arguments["early_stop"] > 0), "DERIVATIVES": int(derivatives)}
+    dev.program("raster/softmax", LANES=lanes(dev), **macros).launch(
         "softmax_weights", pixels, sharpness=1 / gamma, **arguments
     )
 

@@ -12,12 +12,11 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes, replayed
+from pp_cl.engine.device.launch import replayed
 from pp_cl.engine.device.scan import nonzero, read_total
-from pp_cl.engine.raster.footprint import footprint_macros
+from pp_cl.engine.raster.footprint import sample_macros
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints
-from pp_cl.engine.raster.samples import sampled_weights
 from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")
@@ -32,15 +31,14 @@ class BlendWeights:
     blend: one of BLENDS. opacity, early_stop: the arguments of blend_weights(). tracked: how many
     nearest fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 |
     point, each pixel's fragments by depth; where fragments are dropped, NO_POINT ends the pixel's
-    list. pixel_derivative: (P,) float32 in the same order, the factor s of the backward pass,
-    dL/dopacity = s * dL/db (cl/raster/blend.cl); (P, samples) if a pixel has several samples; None
-    without derivatives.
+    list. pixel_derivative: (P, samples) float32 in the same order, the factor s of the backward
+    pass, dL/dopacity = s * dL/db (cl/raster/blend.cl); None without derivatives.
 
     point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, the index of a
     visible point in `visible`, undefined for others. transmittance: (HW,) float32 behind all
-    fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, if a
-    pixel has several. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32, the
-    number of visible points; count: that number, downloaded by read_count().
+    fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, None
+    without derivatives, too. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32,
+    the number of visible points; count: that number, downloaded by read_count().
     """
 
     blend: str
@@ -85,11 +83,9 @@ def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table
         "point_slot": ((n,), np.uint32),
         "visible_count": ((1,), np.uint32),
     }
-    if derivatives and side > 1:
-        table["sample_transmittance"] = (pixels, side**2), np.float32
     if derivatives:
-        by_sample = (side**2,) if side > 1 else ()
-        table["pixel_derivative"] = (derivatives, *by_sample), np.float32
+        table["sample_transmittance"] = (pixels, side**2), np.float32
+        table["pixel_derivative"] = (derivatives, side**2), np.float32
     return table
 
 
@@ -97,8 +93,8 @@ def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table
 def blend_weights(
     dev: Device,
     b: Buffers,
+    points: ProjectedPoints,
     pairs: Pairs,
-    camera_buffer: Array,
     opacity: Array,
     *,
     blend: str,
@@ -106,42 +102,46 @@ def blend_weights(
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
-    points: ProjectedPoints | None = None,
 ) -> BlendWeights:
-    """The weights of all pairs, in the buffers b of find_pairs().
+    """The weights of all pairs of these points, in the buffers b of find_pairs().
 
-    opacity: (N,) float32 in [0, 1]. blend: one of BLENDS. gamma: depth sharpness of the softmax.
-    max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
-    all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
-    have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
-    pass reads. points: needed if a pixel has several samples (alpha compositing of discs).
-    read_count() downloads the number of visible points.
+    opacity: (N,) float32 in [0, 1]. blend: one of BLENDS; a pixel with several samples needs
+    "alpha", and discs. gamma: depth sharpness of the softmax. max_tracked: only this many nearest
+    fragments of a pixel get gradients (64 in the paper); 0: all. early_stop: in [0, 1): a pixel
+    drops all fragments behind the depth where no fragment can have this share any more (0.001 in
+    the paper); 0: none. derivatives: write what the backward pass reads. read_count() downloads the
+    number of visible points.
     """
-    side, capacity = pairs.side, pairs.capacity if derivatives else 0
+    side, capacity = points.side, pairs.capacity if derivatives else 0
     b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
     dev.fill(b.point_is_visible, 0)
-    defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
     derivative = b.pixel_derivative if derivatives else None
+    sample_transmittance = b.sample_transmittance if derivatives else None
     shared: dict[str, Any] = {
         "hw": pairs.pixels,
         "early_stop": early_stop,
+        "camera": points.camera_buffer,
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
+        "pair_point_falloff": pairs.pair_point_falloff,
         "opacity": opacity,
         "pixel_weight_point": b.pair_scratch,
+        "pixel_derivative": derivative,
         "point_is_visible": b.point_is_visible,
     }
-    of_one = {"pair_point_falloff": pairs.pair_point_falloff, "pixel_derivative": derivative}
-    sampled: Array | None = None
-    if points and side > 1:
-        sampled = sampled_weights(dev, b, points, pairs, derivatives, **shared)
-    elif blend == "alpha":
-        program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
-        shared |= {"transmittance": b.transmittance, **of_one}
-        program.launch("alpha_weights", pairs.pixels, **shared)
+    if blend == "alpha":
+        macros = sample_macros(dev, points.footprint, side)
+        dev.program("raster/alpha", DERIVATIVES=int(derivatives), **macros).launch(
+            "alpha_weights",
+            pairs.pixels,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            transmittance=b.transmittance,
+            sample_transmittance=sample_transmittance,
+            **shared,
+        )
     else:
-        shared |= {"camera": camera_buffer, **of_one}
-        softmax_weights(dev, pairs.pixels, gamma, defines, **shared)
+        softmax_weights(dev, pairs.pixels, gamma, derivatives, **shared)
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,
@@ -155,7 +155,7 @@ def blend_weights(
         b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
-        sampled,
+        sample_transmittance if blend == "alpha" else None,
     )
 
 
@@ -181,7 +181,7 @@ def listed_fragments(
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set pair_gradient, (P, 1 + samples) float32, to 0 at the pairs of visible points."""
     count = weights.total
-    dev.program("raster/clear_pairs", SAMPLES=pairs.side**2).launch(
+    dev.program("raster/clear_pairs", SAMPLES=pair_gradient.shape[1] - 1).launch(
         "clear_pairs",
         count,
         s=count,

@@ -33,7 +33,7 @@ def depth_gradient(
     size: (H, W). voxel_size: world units.
     """
     b.require(depth_loss_table(pairs.pixels))
-    program = dev.program("training/depth_loss", SIDE=pairs.side)
+    program = dev.program("training/depth_loss", SIDE=points.side)
     program.launch(
         "pixel_surface",
         pairs.pixels,
