@@ -42,7 +42,11 @@ def test_a_falloff_that_is_rounded_below_0_has_a_depth(dev):
 
 
 @pytest.mark.exact
-def test_a_nan_is_not_hidden(dev):
-    scene, _ = blend_on_axis(dev, [0.9], [np.nan], 0.1, rule="alpha")
+@pytest.mark.parametrize("side", [1, 2])
+def test_a_nan_is_not_hidden(dev, side):
+    scene = PairedPoints(dev, make_camera(24, 20), np.zeros((1, 3)), 0.4, side=side)
+    scene.blend([np.nan], 0.1, np.zeros((1, 16)), rule="alpha")
+    covered = scene.pairs.pair_pixel.get()[: scene.pairs.total]
+    assert len(covered) > 10
     for array in depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape):
-        assert np.isnan(array.get())
+        assert np.isnan(array.get().ravel()[covered]).all()
