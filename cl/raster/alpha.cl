@@ -90,9 +90,7 @@ kernel void alpha_weights(
             if (DERIVATIVES)
                 LANES_INTO(pixel_derivative + (size_t)SAMPLES * i, select(none, T * d, shows));
             point_is_visible[point] = 1;
-            const floats through = 1.0f - alpha;
-            // fmax() would hide a NaN
-            T *= select(through, (floats)(LEAST_THROUGH), through < LEAST_THROUGH);
+            T = transmit(T, alpha);
         }
     }
     if (i < end) pixel_weight_point[i] = NONE;

@@ -61,11 +61,9 @@ kernel void depth_forward(
             const floats b = upper_float(pixel_weight_point[i]);
 #else
             const ints shows = (T >= early_stop) & (f.falloff != 0.0f);
-            const floats through = 1.0f - opacity[f.point] * f.falloff;
-            const floats b = select(none, T * (opacity[f.point] * f.falloff), shows);
-            T *= select(
-                (floats)(1.0f), select(through, (floats)(LEAST_THROUGH), through < LEAST_THROUGH),
-                shows);
+            const floats seen = select(none, opacity[f.point] * f.falloff, shows);
+            const floats b = T * seen;
+            T = transmit(T, seen);
 #endif
             if (pass == 0) {
                 alpha += b;
@@ -74,7 +72,7 @@ kernel void depth_forward(
             const floats z = m.per_length * surface_range(
                                                 upper_float(pair_key[i]),
                                                 point_shape[(size_t)SHAPE * f.point], f.falloff);
-            depth += select(none, b * z, shows);
+            depth += b * z;
             const floats half_left = 0.5f * alpha - reached;
             const floats share = select((floats)(1.0f), fmin(half_left / b, 1.0f), b > 0.0f);
             const floats there = select(z, before + share * (z - before), is_behind);

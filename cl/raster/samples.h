@@ -72,4 +72,11 @@ ALWAYS_INLINE Fragment fragment_load(
 #endif
 }
 
+// The transmittance behind fragments of which samples see this alpha, with T in front. fmax() would
+// hide a NaN.
+ALWAYS_INLINE floats transmit(const floats T, const floats alpha) {
+    const floats through = 1.0f - alpha;
+    return T * select(through, (floats)(LEAST_THROUGH), through < LEAST_THROUGH);
+}
+
 #endif
