@@ -44,7 +44,7 @@ FLIPS = [
     ("raster/highest_weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
     ("raster/softmax", "(floats)(-M)), 0.0f", "(floats)(M)), 0.0f", "softmax: forward, disc"),
     ("raster/softmax", "1.0f + o_z *", "1.0f - o_z *", "softmax: backward, soft"),
-    ("raster/samples.h", "through = 1.0f - alpha", "through = 1.0f + alpha", "alpha: forward, soft"),
+    ("raster/samples.h", "= 1.0f - alpha", "= 1.0f + alpha", "alpha: forward, soft"),
     ("raster/alpha", "b / T * dL_db", "T / b * dL_db", "alpha: backward, soft"),
     ("raster/alpha", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
