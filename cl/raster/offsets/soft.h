@@ -17,7 +17,7 @@ typedef struct {
 
 ALWAYS_INLINE OffsetGradient
 offset_begin(const Camera *cam, const float4 centre, global const float *shape) {
-    const float t = centre.w, h = fmax(shape[0], LEAST_RADIUS * t / least_focal(cam));
+    const float t = centre.w, h = reach_of(cam, centre, shape[0]);
     OffsetGradient sum;
     sum.centre = centre;
     sum.per_h2 = 1.0f / (h * h);

@@ -9,8 +9,8 @@ from pp_cl.engine.device.launch import lanes
 def softmax_weights(
     dev: Device, pixels: int, gamma: float, derivatives: bool, **arguments: Any
 ) -> None:
-    """Compute the blend weights of Eq. (1). gamma: depth sharpness. derivatives: write them.
-    arguments: the kernel's.
+    """Compute the blend weights of Eq. (1). gamma: depth sharpness. derivatives: also write
+    pixel_derivative. arguments: the kernel's.
     """
     macros = {"DROPS": int(arguments["early_stop"] > 0), "DERIVATIVES": int(derivatives)}
     dev.program("raster/softmax", LANES=lanes(dev), **macros).launch(
