@@ -54,7 +54,7 @@ test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if
 # With it PoCL divides with errors up to 2.5 ulp, as GPUs may; more than they do, it takes no number for NaN or infinite.
 test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse division that GPUs may have
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
-		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/engine/device/test_rounding.py tests/engine/raster/test_pulsar.py)
+		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/engine/device/test_rounding.py)
 
 test-no-unix: $(READY) ## run the tests without fcntl, resource, os.fork and the signals that Windows lacks
 	@PYTHONPATH=$(CURDIR)/tests/support/hidden $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)

@@ -17,7 +17,6 @@
 #define LANES_INTO(p, value) vstore16(value, 0, p)
 #define ANY_LANE(v) any(v)
 #define SUM_LANES(v) sum16(v)
-#define MAX_LANES(v) max16(v)
 // load_lanes(p, count): the values at p, of which `count` exist; the others read as 0.
 // store_lanes(value, p, count): writes the first `count` of the values to p.
 #define load_lanes load16
@@ -28,20 +27,11 @@
 #include "gpu/lanes.h"
 #endif
 
-#ifndef ON_CPU
-#define ON_CPU (LANES == 16)  // given where lanes are the samples of a pixel
-#endif
+#define ON_CPU (LANES == 16)
 
-// Steps of a walk whose reads do not wait for each other: 4 on GPUs, where a read takes hundreds of
-// cycles, 1 on CPUs.
-#ifndef BATCH
-#define BATCH (ON_CPU ? 1 : 4)
-#endif
-
-// Asks for what lies at a global address before it is read, on CPUs, where walks over fragments and
-// points wait mostly for what lies anywhere in memory. They look so many fragments or points ahead.
+// Asks for what lies at a global address before it is read, on CPUs, where walks over points wait
+// mostly for what lies anywhere in memory. They look so many points ahead.
 // A simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
-#define FRAGMENTS_AHEAD 32
 #define POINTS_AHEAD 8
 #if ON_CPU && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)

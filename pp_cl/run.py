@@ -219,7 +219,7 @@ class Run:
         def sample(dx, dy):
             result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)
             with self.dev.stage("depth"):
-                view = result.points, result.pairs, result.weights, result.size
+                view = result.points, result.pairs, result.weights
                 depths = depth_forward(self.dev, *view, self.model.grid.voxel_size)
             layers = [result.cropped(self.dev.download(array)) for array in depths]
             if features:

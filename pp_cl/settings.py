@@ -66,14 +66,13 @@ class RasterConfig:
 
     footprint: str = setting(
         "soft",
-        "soft: opacity falls linearly to the rim; disc: the paper's hard disc; sphere: Pulsar's"
-        " rules, for any radius",
-        choices=("soft", "disc", "sphere"),
+        "soft: opacity falls linearly to the rim; disc: the paper's hard disc",
+        choices=("soft", "disc"),
     )
     radius: float = setting(
         0.0,
         "before points learn their own (train.offset_rate). soft: in point spacings (0: one pixel"
-        " of the images); disc, sphere: in world units at a depth range of 4",
+        " of the images); disc: in world units at a depth range of 4",
         0,
         100,
     )
@@ -83,7 +82,10 @@ class RasterConfig:
         choices=("softmax", "alpha"),
     )
     max_tracked: int = setting(
-        0, "number of a pixel's nearest fragments that receive gradients (0: all)", 0, 2**31 - 1
+        0,
+        "softmax: number of a pixel's nearest fragments that receive gradients (0: all)",
+        0,
+        2**31 - 1,
     )
     early_stop: float = setting(
         0.01, "stop blending once no fragment can weigh more than this share (0: never)", 0, 0.5

@@ -13,7 +13,6 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.engine.network.layers import multiplications
-from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.engine.views import evenly
 from pp_cl.files.image import read_rgba
 from pp_cl.run import MARGIN, load
@@ -82,8 +81,8 @@ def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
     counted = []
     for camera in evenly(run.cameras("train"), 8):
         result = run.renderer.forward(camera, run.gamma, until="weights")
-        dropped = result.fragments().sum() - listed_fragments(result.pairs, result.weights)[0].sum()
-        counted.append([result.fragments().sum(), dropped, len(result.weights.visible)])
+        found, shown = (counts.sum() for counts in result.fragments())
+        counted.append([found, found - shown, len(result.weights.visible)])
     fragments, dropped, drawn = np.mean(counted, 0)
     assert work["views"] == 8 and work["drawn"] == drawn
     assert work["fragments"] == {"found": fragments, "blended": fragments - dropped}

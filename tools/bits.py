@@ -60,7 +60,7 @@ SETTINGS = {
     "ignored": NEVER | {"train.pixel_jitter": False},
     "refined": {"train.refine_at": (0.5, 1.0)},
     "supersampled": NEVER | {"train.supersampled": 1.0},
-    "spheres": NEVER | {"raster.footprint": "sphere", "raster.radius": 0.08},
+    "discs": NEVER | {"raster.footprint": "disc", "raster.radius": 0.05},
     "gaussians": NEVER,  # which are fitted to the run
 }
 

@@ -1,4 +1,4 @@
-// lanes.h for 4 lanes or a single one: on GPUs, and of the samples of a pixel on CPUs too.
+// lanes.h for 4 lanes or a single one, on GPUs.
 #ifndef PP_GPU_LANES_H
 #define PP_GPU_LANES_H
 
@@ -28,7 +28,6 @@ REDUCE4(sum4, float, SUM)
 #define LANES_INTO(p, value) (*(p) = (value))
 #define ANY_LANE(v) ((v) != 0)
 #define SUM_LANES(v) (v)
-#define MAX_LANES(v) (v)
 #define load_lanes(p, count) (*(p))
 #define store_lanes(value, p, count) (*(p) = (value))
 #endif

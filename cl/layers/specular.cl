@@ -56,21 +56,19 @@ ALWAYS_INLINE void dense(
 kernel void specular_forward(
     const uint n,  // pixels
     const uint width,
-    const float side,                        // camera pixels along a side of an image pixel
-    const float extent,                      // world units of 1 in places
-    global const float *camera,              // (21) camera.h
-    global const float *transmittance,       // (n)
-    global const float *features,            // (H, W, 16)
-    global const uint *pixel_offset,         // (n+1)
-    global const ulong *pair_key,            // (P) depth << 32 | pair, sorted within a pixel
-    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    global const float *weight_a,            // (HIDDEN/16, 1, 1, INPUTS, 16)
-    global const float *bias_a,              // (HIDDEN)
-    global const float *weight_b,            // (HIDDEN/16, 1, 1, HIDDEN, 16)
-    global const float *bias_b,              // (HIDDEN)
-    global const float *weight_c,            // (1, 1, 1, HIDDEN, 16)
-    global const float *bias_c,              // (16)
-    global float *image)                     // (H, W, 3)
+    const float side,                   // camera pixels along a side of an image pixel
+    const float extent,                 // world units of 1 in places
+    global const float *camera,         // (21) camera.h
+    global const float *transmittance,  // (n)
+    global const float *features,       // (H, W, 16)
+    global const float *mean_range,     // (n) of what the pixels show, raster/weights.cl
+    global const float *weight_a,       // (HIDDEN/16, 1, 1, INPUTS, 16)
+    global const float *bias_a,         // (HIDDEN)
+    global const float *weight_b,       // (HIDDEN/16, 1, 1, HIDDEN, 16)
+    global const float *bias_b,         // (HIDDEN)
+    global const float *weight_c,       // (1, 1, 1, HIDDEN, 16)
+    global const float *bias_c,         // (16)
+    global float *image)                // (H, W, 3)
 {
     KEPT floats kept[TOGETHER * INPUTS], other[TOGETHER * HIDDEN];
     const Camera cam = camera_load(camera);
@@ -95,8 +93,7 @@ kernel void specular_forward(
             ((float *)direction)[lane] = d.x;
             ((float *)(direction + 1))[lane] = d.y;
             ((float *)(direction + 2))[lane] = d.z;
-            const uint begin = pixel_offset[pixel], end = pixel_offset[pixel + 1];
-            const float3 p = place_of(&cam, d, begin, end, pair_key, pixel_weight_point, extent);
+            const float3 p = place_of(&cam, d, mean_range[pixel], extent);
             ((float *)place)[lane] = p.x;
             ((float *)(place + 1))[lane] = p.y;
             ((float *)(place + 2))[lane] = p.z;

@@ -36,23 +36,11 @@ static inline float3 direction_of(const Camera *cam, const uint x, const uint y,
     return normalize(across * cam->right + down * cam->down + cam->forward);
 }
 
-// The place that a pixel with fragments shows, from the middle of the scene in units of `extent`:
-// where its ray is at the mean distance of its fragments, by blend weight.
-static inline float3 place_of(
-    const Camera *cam,
-    const float3 direction,
-    const uint begin,  // of the pixel's fragments
-    const uint end,
-    global const ulong *pair_key,            // (P) depth << 32 | pair
-    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    const float extent) {
-    float weights = 0.0f, distance = 0.0f;
-    for (uint i = begin; i < end && (uint)pixel_weight_point[i] != NONE; i++) {
-        const float b = upper_float(pixel_weight_point[i]);
-        weights += b;
-        distance += b * upper_float(pair_key[i]);
-    }
-    return (cam->eye + distance / weights * direction) / extent;
+// The place that a pixel shows, from the middle of the scene in units of `extent`: where its ray is
+// at a range.
+static inline float3
+place_of(const Camera *cam, const float3 direction, const float range, const float extent) {
+    return (cam->eye + range * direction) / extent;
 }
 
 #endif

@@ -25,23 +25,6 @@ kernel void tiles_find(
     flags[tile] = other;
 }
 
-// One work-item per tile: reads where the fragments of its pixels begin, writes 1 if any pixel has
-// fragments, else 0.
-kernel void tiles_covered(
-    const int h,
-    const int w,
-    global const uint *pixel_offset,  // (H*W+1)
-    global int *flags)                // (?, ?) tiles
-{
-    const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
-    if (tile >= columns * rows) return;
-    const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE, x1 = min(x0 + SIDE, w);
-    int covered = 0;
-    for (int y = y0; y < min(y0 + SIDE, h); y++)
-        covered |= pixel_offset[y * w + x0] != pixel_offset[y * w + x1];
-    flags[tile] = covered;
-}
-
 // One work-item per (LANES channels, pixel of a tile, copy): writes the pixel of the tile `to` as
 // it is in the tile `from`. Both have the same shape, and nothing is copied to `from`.
 kernel void tiles_copy(

@@ -1,16 +1,14 @@
-// Footprints: which pixels points cover, their falloff d there (1 in the centre, 0 at the rim)
-// and their depth. Each kind of point is a header with the same three functions:
+// Footprints: which samples points cover, their falloff d there (1 in the centre, 0 at the rim), and
+// the derivatives of d. Each kind of point is a header with the same functions:
 //
-// footprints_box()  their shape, and the pixels that they may cover: the first and last along x and
-//                   y; false if none of those that are kept covers any
-// footprints_rim()  what follows from place and shape for all pixels
-// footprints_cover()  whether they cover a pixel (px, py) each, with d and depth
+// footprints_box()    of LANES points: their shape, and the samples that they may cover; false if
+//                     none of those that are kept covers any
+// coverage_at()       which of LANES samples one point covers, with its falloff
+// derivatives_add()   adds what samples contribute to the gradients of a point's place and shape
+// derivatives_end()   the gradient of its offset (cloud.h), from these sums
 //
 // Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray
 // meets the surface for which a point stands, and constants of blending and shading.
-//
-// Counting (project.cl) and filling (pairs.cl) must find the same fragments, so no compiler may
-// round here in one way and there in another: FP_CONTRACT is OFF in what leads to a fragment.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
@@ -21,31 +19,23 @@
 // the kinds
 #define DISC 0
 #define SOFT 1
-#define SPHERE 2
-#define GAUSSIAN 3
+#define GAUSSIAN 2
 #ifndef FOOTPRINT
 #define FOOTPRINT SOFT
 #endif
-#ifndef SHAPE
-#define SHAPE 1  // numbers in a row of point_shape: the radius; of Gaussians 4
+#ifndef RECORD
+#define RECORD 8  // words of a point's record, 16 of a Gaussian
 #endif
 #ifndef MOST_OFFSET
 #define MOST_OFFSET 0.5f  // of points that are no Gaussians, pp_cl/engine/raster/footprint.py
 #endif
 
-// Samples of a pixel, each way: the camera's pixels are the samples, boxes and lists are of pixels.
+// Samples of a pixel, each way: the camera's pixels are the samples, boxes are of pixels.
 #ifndef SIDE
 #define SIDE 1
 #endif
 #define SAMPLES (SIDE * SIDE)
-
-// What a pair keeps of its fragment: the point and, of a single sample, the bits of its falloff.
-#if SIDE == 1
-#define STORE_FRAGMENT(point, falloff, pair, pairs)                                                \
-    vstore2((uint2)(point, as_uint(falloff)), pair, pairs)
-#else
-#define STORE_FRAGMENT(point, falloff, pair, pairs) ((pairs)[pair] = (point))
-#endif
+#define TILE_SIDE (16 / SIDE)  // pixels along a tile, tiles.h
 
 // The least of 1 - alpha, so that what lies behind an opaque fragment is known when gradients are
 // computed; far below what an image shows.
@@ -58,9 +48,51 @@
 // pixels).
 #define LEAST_RADIUS 0.75f
 
+// a b + c, rounded once in every kernel: the way back must find the samples covered that the way
+// there did, and a compiler may fuse products and sums here in one way and there in another.
+// Processors without the instruction fuse none.
+#if defined(FP_FAST_FMAF) || defined(__FMA__)
+#define FMA(a, b, c) fma((floats)(a), (floats)(b), (floats)(c))
+#else
+#define FMA(a, b, c) ((a) * (b) + (c))
+#endif
+
+// What is stored of a point in a view, in a record of words: c, size, opacity, first and last, and of
+// a Gaussian W and centre.
+typedef struct {
+    float4 c;       // its centre in camera axes, and the distance from the eye
+    float size;     // of a disc: the radius, with the sign - if it is the least one; of a Gaussian:
+                    // the falloff in the centre
+    float opacity;  // as seen from the eye
+    uint2 first, last;  // pixels of the box
+#if RECORD > 8
+    float3 W;       // deviations at (x, y) pixels from the centre are (W0 x + W1 y, W2 y)
+    float2 centre;  // pixels
+#endif
+} Point;
+
+// The point of row i of records, which lie in global or local memory.
+#define POINT_OF(records, i)                                                                       \
+    point_of(                                                                                      \
+        vload8((i) * (size_t)(RECORD / 8), records),                                               \
+        vload8((i) * (size_t)(RECORD / 8) + (RECORD > 8), records))
+
+ALWAYS_INLINE Point point_of(const uint8 words, const uint8 more) {
+    Point p;
+    p.c = as_float4(words.s0123);
+    p.size = as_float(words.s4);
+    p.opacity = as_float(words.s5);
+    p.first = (uint2)(words.s6 & 0xffff, words.s6 >> 16);
+    p.last = (uint2)(words.s7 & 0xffff, words.s7 >> 16);
+#if RECORD > 8
+    p.W = as_float3(more.s012);
+    p.centre = as_float2(more.s34);
+#endif
+    return p;
+}
+
 // 1 / a to half an ulp, by a step of Newton's: a GPU's division may be off by 2.5, which shifts all
-// rays. Near its rim, a sphere's weight is a small difference of lengths times up to exp(1 /
-// gamma).
+// rays.
 static inline float reciprocal(const float a) {
     const float nearly = 1.0f / a;
     return nearly + nearly * fma(-a, nearly, 1.0f);
@@ -74,44 +106,29 @@ static inline float least_focal(const Camera *cam) {
 
 // The footprints of LANES neighbouring points, one lane each.
 typedef struct {
-    floats x, y, z;       // centre, camera axes
-    floats t;             // its distance from the eye
-    floats shape[SHAPE];  // as the kind has it
-    int box[4][LANES];    // first x, first y, last x, last y; no pixel: last before first
-    int columns, rows;    // of the widest and the highest box
+    floats x, y, z;  // centre, camera axes
+    floats t;        // its distance from the eye
+    floats size;     // as a Point has it
+#if RECORD > 8
+    floats W[3], centre[2];
+#endif
+    ints first[2], last[2];  // samples that they may cover, before clipping to the image
 } Footprints;
 
-// How they cover a pixel each.
-typedef struct {
-    ints covers;  // lanes that cover it are not 0
-    floats falloff, depth;
-} Coverage;
-
-// Fills in `columns` and `rows`.
-ALWAYS_INLINE void footprints_measure(Footprints *f) {
-    f->columns = f->rows = 0;
-    GPU_UNROLLED_FOR (uint j = 0; j < LANES; j++) {
-        f->columns = max(f->columns, f->box[2][j] - f->box[0][j] + 1);
-        f->rows = max(f->rows, f->box[3][j] - f->box[1][j] + 1);
-    }
-}
-
-// First and last pixel along one axis whose centres lie between two places, and `more` on each
-// side, before clipping to the image: -2 to size + 1. low, high: in pixels, less half of one; not
-// bounded: of the whole image.
+// First and last pixel along one axis whose centres lie between two places, before clipping to the
+// image: -2 to size + 1. low, high: in pixels, less half of one; not bounded: of the whole image.
 ALWAYS_INLINE void pixels_between(
     const floats low,
     const floats high,
     const ints bounded,
     const float size,
-    const int more,
     ints *first,
     ints *last) {
     const floats from = clamp(select((floats)(-2.0f), low, bounded), -2.0f, size);
     const floats to = clamp(select((floats)(size), high, bounded), -2.0f, size);
     // x + 2 >= 0, so truncation is floor
-    *first = LANED(convert_int)(from + 2.0f) - 1 - more;
-    *last = LANED(convert_int)(to + 2.0f) - 2 + more;
+    *first = LANED(convert_int)(from + 2.0f) - 1;
+    *last = LANED(convert_int)(to + 2.0f) - 2;
 }
 
 // Whether circles around (u, z), u = x or y, come so near to the image along that axis that they
@@ -132,31 +149,43 @@ ALWAYS_INLINE ints reaches_image(
 
 // The squared length. A function of vectors: else PoCL splits them in those that it is called from.
 ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
-#pragma OPENCL FP_CONTRACT OFF
     return x * x + y * y + z * z;
 }
+
+// 1 / sqrt(x) and 1 / x. CPUs have instructions for at least 11 bits, which a step of Newton's
+// doubles.
+ALWAYS_INLINE floats per_root(const floats x) {
+#if ON_CPU
+    const floats nearly = native_rsqrt(x);
+    return nearly * (1.5f - 0.5f * x * nearly * nearly);
+#else
+    return rsqrt(x);
+#endif
+}
+
+ALWAYS_INLINE floats inverse(const floats x) {
+#if ON_CPU
+    const floats nearly = native_recip(x);
+    return nearly * (2.0f - x * nearly);
+#else
+    return 1.0f / x;
+#endif
+}
+
+// The rays (x, y, 1) through the samples of a block of a tile, in camera axes, and the samples.
+typedef struct {
+    floats x, y, length2, per_length;
+#if FOOTPRINT == GAUSSIAN
+    floats column, row;  // their centres, pixels
+#endif
+} Rays;
 
 #if FOOTPRINT == DISC
 #include "raster/footprint/disc.h"
 #elif FOOTPRINT == SOFT
 #include "raster/footprint/soft.h"
-#elif FOOTPRINT == SPHERE
-#include "raster/footprint/sphere.h"
 #elif FOOTPRINT == GAUSSIAN
 #include "raster/footprint/gaussian.h"
 #endif
-
-// Tests pixel (column, row) of each point's box, which it covers if it covers one of the samples;
-// falloff and depth are of the first.
-ALWAYS_INLINE Coverage
-footprints_test(const Footprints *f, const Rim *rim, const int column, const int row) {
-    const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
-    const floats px = LANED(convert_float)(SIDE * x), py = LANED(convert_float)(SIDE * y);
-    Coverage c = footprints_cover(f, rim, px, py);
-    UNROLLED_FOR (int s = 1; s < SAMPLES; s++)
-        c.covers |= footprints_cover(f, rim, px + s % SIDE, py + s / SIDE).covers;
-    c.covers &= x <= LANES_FROM(f->box[2]) & y <= LANES_FROM(f->box[3]);
-    return c;
-}
 
 #endif

@@ -36,33 +36,30 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// Writes the opacities of `count` points from `first` on, as cloud.h has them, in the direction from
-// the eye, (x, y, z) of any length.
-ALWAYS_INLINE void opacities_from_eye(
+// The opacities of `count` points from `first` on, as cloud.h has them, in the direction from the eye,
+// (x, y, z) of any length.
+ALWAYS_INLINE floats opacities_from_eye(
     const floats x,
     const floats y,
     const floats z,
     const uint first,
     const uint count,
-    global const float *opacity,
-    global float *point_opacity) {
+    global const float *opacity) {
     const floats distance = sqrt(square(x, y, z));
     floats basis[OPACITIES], seen = 0.0f;
     SH_BASIS(basis, x / distance, y / distance, z / distance)
     basis[0] = 1.0f;
-    float learned[LANES], found[LANES];
+    float learned[LANES];
     GPU_UNROLLED_FOR (uint k = 0; k < OPACITIES; k++) {
         for (uint j = 0; j < LANES; j++)
             learned[j] = opacity[OPACITIES * (size_t)(first + min(j, count - 1)) + k];
         seen += basis[k] * LANES_FROM(learned);
     }
-    LANES_INTO(found, BOUNDED(seen, (floats)(0.0f), (floats)(1.0f)));
-    for (uint j = 0; j < count; j++)
-        point_opacity[first + j] = found[j];
+    return BOUNDED(seen, (floats)(0.0f), (floats)(1.0f));
 }
 
 // Reads the grid indices, offsets and opacities of `count` points from `first` on, writes what
-// project_grid says of them and returns the sum of their fragments.
+// project_grid says of them and returns the sum of their tiles.
 ALWAYS_INLINE uint project_vertices(
     const Camera *cam,
     const uint first,
@@ -72,55 +69,82 @@ ALWAYS_INLINE uint project_vertices(
     const float radius,
     global const float *cloud_offset,
     global const float *opacity,
-    global float4 *point_camera,
-    global float *point_shape,
-    global ushort4 *point_box,
-    global uint *point_count,
-    global float *point_opacity) {
+    global uint *point_record,
+    global uint *point_count) {
     // most points of a crop lie beside it
     const uint one = point_id[first], other = point_id[first + count - 1];
-    if (LANES > 1 && (one ^ other) >> 3 * BRICK_BITS == 0 && brick_misses(cam, grid, one, radius)) {
+    bool misses =
+        LANES > 1 && (one ^ other) >> 3 * BRICK_BITS == 0 && brick_misses(cam, grid, one, radius);
+    Footprints f;
+    ints in_image;
+    floats px, py, pz;
+    if (!misses) {
+        uint id[LANES];
+        float offset[3 + FORM][LANES];
+        for (uint j = 0; j < LANES; j++) {
+            const size_t row = first + min(j, count - 1);
+            id[j] = point_id[row];
+            GPU_UNROLLED_FOR (uint k = 0; k < 3 + FORM; k++)
+                offset[k][j] = cloud_offset[OFFSETS * row + k];
+        }
+        // as grid_vertex() has it
+        const uints ids = LANES_FROM(id);
+        uints x = ids >> 3 * BRICK_BITS;
+        uints y = divide(&x, bricks(grid[4]));
+        const uints z = divide(&y, bricks(grid[5]));
+        const uints i = BRICK * x + (ids & (BRICK - 1));
+        const uints j = BRICK * y + (ids >> BRICK_BITS & (BRICK - 1));
+        const uints k = BRICK * z + (ids >> 2 * BRICK_BITS & (BRICK - 1));
+        floats form[FORM];
+        GPU_UNROLLED_FOR (uint number = 0; number < FORM; number++) {
+            const floats learned = LANES_FROM(offset[3 + number]);
+            form[number] = radius * (number < LOGS ? exp(learned) : learned);
+        }
+        px = grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0]));
+        py = grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1]));
+        pz = grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2]));
+        misses = !project(cam, px, py, pz, LOGS == 1 ? form[0] : radius, form, &f, &in_image);
+    }
+    if (misses || !ANY_LANE(in_image)) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
         return 0;
     }
-    uint id[LANES];
-    float offset[3 + FORM][LANES];
-    for (uint j = 0; j < LANES; j++) {
-        const size_t row = first + min(j, count - 1);
-        id[j] = point_id[row];
-        GPU_UNROLLED_FOR (uint k = 0; k < 3 + FORM; k++)
-            offset[k][j] = cloud_offset[OFFSETS * row + k];
+    const floats seen = opacities_from_eye(
+        px - cam->eye.x, py - cam->eye.y, pz - cam->eye.z, first, count, opacity);
+    uint words[RECORD][LANES], sum = 0;
+    int tiles[LANES];
+    LANES_INTO(words[0], LANED(as_uint)(f.x));
+    LANES_INTO(words[1], LANED(as_uint)(f.y));
+    LANES_INTO(words[2], LANED(as_uint)(f.z));
+    LANES_INTO(words[3], LANED(as_uint)(f.t));
+    LANES_INTO(words[4], LANED(as_uint)(f.size));
+    LANES_INTO(words[5], LANED(as_uint)(seen));
+    LANES_INTO(words[6], LANED(as_uint)(f.first[0] / SIDE | f.first[1] / SIDE << 16));
+    LANES_INTO(words[7], LANED(as_uint)(f.last[0] / SIDE | f.last[1] / SIDE << 16));
+#if RECORD > 8
+    for (uint k = 0; k < 3; k++)
+        LANES_INTO(words[8 + k], LANED(as_uint)(f.W[k]));
+    for (uint k = 0; k < 5; k++)
+        LANES_INTO(words[11 + k], LANED(as_uint)(k < 2 ? f.centre[k] : (floats)(0.0f)));
+#endif
+    LANES_INTO(tiles, count_tiles(&f, in_image));
+    for (uint j = 0; j < count; j++) {
+        point_count[first + j] = tiles[j];
+        sum = add_sat(sum, (uint)tiles[j]);
+        if (tiles[j] == 0) continue;
+        uint record[RECORD];
+        GPU_UNROLLED_FOR (uint k = 0; k < RECORD; k++)
+            record[k] = words[k][j];
+        for (uint k = 0; k < RECORD; k += 8)
+            vstore8(vload8(0, record + k), 0, point_record + RECORD * (size_t)(first + j) + k);
     }
-    // as grid_vertex() has it
-    const uints ids = LANES_FROM(id);
-    uints x = ids >> 3 * BRICK_BITS;
-    uints y = divide(&x, bricks(grid[4]));
-    const uints z = divide(&y, bricks(grid[5]));
-    const uints i = BRICK * x + (ids & (BRICK - 1));
-    const uints j = BRICK * y + (ids >> BRICK_BITS & (BRICK - 1));
-    const uints k = BRICK * z + (ids >> 2 * BRICK_BITS & (BRICK - 1));
-    floats form[FORM];
-    GPU_UNROLLED_FOR (uint number = 0; number < FORM; number++) {
-        const floats learned = LANES_FROM(offset[3 + number]);
-        form[number] = radius * (number < LOGS ? exp(learned) : learned);
-    }
-    const floats px = grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0]));
-    const floats py = grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1]));
-    const floats pz = grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2]));
-    const uint fragments = project_points(
-        cam, px, py, pz, LOGS == 1 ? form[0] : radius, form, first, count, point_camera,
-        point_shape, point_box, point_count);
-    if (fragments > 0)
-        opacities_from_eye(
-            px - cam->eye.x, py - cam->eye.y, pz - cam->eye.z, first, count, opacity,
-            point_opacity);
-    return fragments;
+    return sum;
 }
 
 // GROUP work-items per block of BLOCK points: read their grid indices, offsets and opacities, write
-// their numbers of fragments and the sum of these and, of LANES points of which any has one, their
-// camera-space positions and distances, shapes, boxes and opacities from the eye.
+// the numbers of tiles that they may cover and the sum of these and, of points that may cover any,
+// their records.
 kernel void project_grid(
     const uint n,                      // points
     global const float *camera,        // (21) camera.h
@@ -129,12 +153,9 @@ kernel void project_grid(
     const float radius,                // of a point without offsets, world units
     global const float *cloud_offset,  // (N, OFFSETS) cloud.h
     global const float *opacity,       // (N, OPACITIES) cloud.h
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
-    global float *point_shape,         // (N, SHAPE) footprint.h
-    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count,   // (N)
-    global uint *block_sum,     // ((N+BLOCK-1)/BLOCK) of point_count
-    global float *point_opacity)  // (N) from the eye
+    global uint *point_record,         // (N, RECORD) footprint.h
+    global uint *point_count,          // (N)
+    global uint *block_sum)            // ((N+BLOCK-1)/BLOCK) of point_count
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint begin = GROUP_ID * BLOCK, end = min(n, begin + BLOCK);
@@ -143,10 +164,9 @@ kernel void project_grid(
     uint sum = 0, total;
     for (uint first = begin + MEMBER * LANES; first < end; first += GROUP * LANES)
         sum = add_sat(
-            sum,
-            project_vertices(
-                &cam, first, min((uint)LANES, end - first), grid, point_id, radius, cloud_offset,
-                opacity, point_camera, point_shape, point_box, point_count, point_opacity));
+            sum, project_vertices(
+                     &cam, first, min((uint)LANES, end - first), grid, point_id, radius,
+                     cloud_offset, opacity, point_record, point_count));
     group_scan(sum, shared, &total);
     if (MEMBER == 0) block_sum[GROUP_ID] = total;
 }

@@ -12,22 +12,23 @@
 // One work-item per part of a visible point: reads its coefficients and where it is, writes its
 // features.
 kernel void shade_forward(
-    const uint s,                       // visible points
-    global const uint *visible,         // (?) their indices, S
-    global const float *camera,         // (21) camera.h
-    global const float4 *point_camera,  // (N, 4) x, y, z, distance
-    global const float16 *sh_0,         // (N, 1, 16)
-    global const float16 *sh_1,         // (?, ?, 16) (N, 3, 16), not read at degree 0
-    global const float16 *sh_2a,        // (?, ?, 16) (N, 3, 16), not read below degree 2
-    global const float16 *sh_2b,        // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *visible_features)   // (?, 16) a row for each
+    const uint s,                      // visible points
+    global const uint *visible,        // (?) their indices, S
+    global const float *camera,        // (21) camera.h
+    global const uint *point_record,   // (N, RECORD) footprint.h
+    global const float16 *sh_0,        // (N, 1, 16)
+    global const float16 *sh_1,        // (?, ?, 16) (N, 3, 16), not read at degree 0
+    global const float16 *sh_2a,       // (?, ?, 16) (N, 3, 16), not read below degree 2
+    global const float16 *sh_2b,       // (?, ?, 16) (N, 2, 16), not read below degree 2
+    global float16 *visible_features)  // (?, 16) a row for each
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = visible[g];
     SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)])
     float basis[9];
-    sh_basis_of_point(camera, point_camera[i], basis);
+    const float4 at = as_float4(vload4(i * (size_t)(RECORD / 4), point_record));
+    sh_basis_of_point(camera, at, basis);
     floats features = basis[0] * load_part(sh_0, i);
     if (DEGREE >= 1)
         for (uint b = 0; b < 3; b++)

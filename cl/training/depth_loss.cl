@@ -5,7 +5,7 @@
 // above S, is left alone. A pixel that is not opaque, or whose neighbour is not, has no such term.
 //
 // z = axis sum b t / (voxel_size sum b) of ranges t, so dz/db_i = axis (t_i - mean) / (voxel_size
-// sum b): alpha.cl adds dL/db_i, its slope times t_i - mean, to G.f_i.
+// sum b): raster/blend.cl adds dL/db_i, its slope times t_i - mean, to G.f_i.
 #include "camera.h"
 #include "common.h"
 
@@ -16,32 +16,24 @@
 #define S2 4.0f      // S = 2 voxels
 #define FARTHEST 4   // the longest stride, pixels
 
-// One work-item per pixel: reads its fragments, writes its surface.
+// One work-item per pixel: writes its surface.
 kernel void pixel_surface(
-    const uint hw,                           // pixels
-    const float voxel_size,                  // world units
-    global const float *camera,              // (21) camera.h, of the samples
-    global const uint *pixel_offset,         // (HW+1)
-    global const ulong *pair_key,            // (P) depth << 32 | pair
-    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    global float4 *surface)                  // (HW, 4) z, mean range, dz/db_i over t_i - mean; 0
+    const uint hw,                      // pixels
+    const float voxel_size,             // world units
+    global const float *camera,         // (21) camera.h, of the samples
+    global const float *transmittance,  // (HW)
+    global const float *mean_range,     // (HW) raster/weights.cl
+    global float4 *surface)             // (HW, 4) z, mean range, dz/db_i over t_i - mean; 0
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     const Camera cam = camera_load(camera);
-    const uint width = cam.width / SIDE, begin = pixel_offset[q];
+    const uint width = cam.width / SIDE;
     const float x = (SIDE * (q % width + 0.5f) - cam.cx) / cam.fx;
     const float y = (SIDE * (q / width + 0.5f) - cam.cy) / cam.fy;
     const float axis = 1.0f / sqrt(x * x + y * y + 1.0f);
-    // ranges count from here, so that sums of them keep their digits
-    const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
-    float alpha = 0.0f, sum = 0.0f;
-    for (uint i = begin; i < pixel_offset[q + 1] && (uint)pixel_weight_point[i] != NONE; i++) {
-        const float b = upper_float(pixel_weight_point[i]);
-        alpha += b;
-        sum += b * (upper_float(pair_key[i]) - nearest);
-    }
-    const float range = nearest + sum / alpha, per_voxel = axis / voxel_size;
+    const float alpha = 1.0f - transmittance[q], per_voxel = axis / voxel_size;
+    const float range = mean_range[q];
     const float4 found = (float4)(per_voxel * range, range, per_voxel / alpha, 0.0f);
     surface[q] = alpha < OPAQUE ? (float4)(0.0f) : found;  // a NaN stays one
 }

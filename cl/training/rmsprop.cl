@@ -16,6 +16,9 @@
 #include "cloud.h"
 #include "sh.h"
 
+#ifndef RECORD
+#define RECORD 8  // words of a point in a view, raster/footprint.h
+#endif
 #ifndef DEGREE
 #define DEGREE 2  // of the highest harmonics to move: 0, 1 or 2
 #endif
@@ -65,7 +68,7 @@ kernel void rmsprop_move(
     const float rate_lobe,       // of the opacity's harmonics of degree 1; half of it of degree 2
     global const uint *visible,  // (?) their indices, S
     global const float *camera,  // (21) camera.h
-    global const float4 *point_camera,            // (N, 4) x, y, z, distance
+    global const uint *point_record,              // (N, RECORD) raster/footprint.h
     global const float16 *grad_visible_features,  // (?, 16) G, a row for each visible point
     global const float *grad_offset,              // (?, OFFSETS) alike, NULL without MOVES_OFFSET
     global const float *grad_opacity,             // (?) alike
@@ -96,7 +99,8 @@ kernel void rmsprop_move(
     if (row >= s || !(any(grad_visible_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
     const float decay = exp2((step - last) * LOG_BETA2);
     float basis[9];
-    sh_basis_of_point(camera, point_camera[i], basis);
+    const float4 at = as_float4(vload4(i * (size_t)(RECORD / 4), point_record));
+    sh_basis_of_point(camera, at, basis);
     if (ROW_PART == 0) {
         last_step[i] = step;
         const float w = decay * v_opacity[i] + DECAY2 * a * a;

@@ -13,18 +13,16 @@ kernel void specular_rows(
     const uint target_width,
     const uint left,  // of the target's corner in the image
     const uint top,
-    const float side,                        // camera pixels along a side of an image pixel
-    const float extent,                      // world units of 1 in places
-    global const uint *chosen,               // (m) pixels of the image
-    global const float *camera,              // (21) camera.h
-    global const float *transmittance,       // (HW) of the image
-    global const float *features,            // (H, W, 16) of the image
-    global const uint *pixel_offset,         // (HW+1)
-    global const ulong *pair_key,            // (P) depth << 32 | pair, sorted within a pixel
-    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    global const float *image,               // (H, W, 3)
-    global const float *target,              // (?, target_width, 3)
-    global half *rows)                       // (ROWS, ROW)
+    const float side,                   // camera pixels along a side of an image pixel
+    const float extent,                 // world units of 1 in places
+    global const uint *chosen,          // (m) pixels of the image
+    global const float *camera,         // (21) camera.h
+    global const float *transmittance,  // (HW) of the image
+    global const float *features,       // (H, W, 16) of the image
+    global const float *mean_range,     // (HW) of what the pixels show, raster/weights.cl
+    global const float *image,          // (H, W, 3)
+    global const float *target,         // (?, target_width, 3)
+    global half *rows)                  // (ROWS, ROW)
 {
     const uint i = get_global_id(0);
     if (i >= m) return;
@@ -35,9 +33,7 @@ kernel void specular_rows(
         vstore_half(features[(size_t)CHANNELS * pixel + c], c, row);
     const float3 direction = direction_of(&cam, x, y, side);
     vstore_half3(direction, 0, row + CHANNELS);
-    const uint begin = pixel_offset[pixel], end = pixel_offset[pixel + 1];
-    const float3 place =
-        place_of(&cam, direction, begin, end, pair_key, pixel_weight_point, extent);
+    const float3 place = place_of(&cam, direction, mean_range[pixel], extent);
     vstore_half3(place, 0, row + CHANNELS + 3);
     const float3 wanted = vload3((size_t)target_width * (y - top) + x - left, target);
     const float alpha = 1.0f - transmittance[pixel];

@@ -9,18 +9,14 @@ from itertools import product
 
 import numpy as np
 
-from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.bench.timing import interleave
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.buffers import Buffers, gather_rows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
-from pp_cl.engine.raster.blend import blend_backward, blend_forward
 from pp_cl.engine.raster.points import PointCloud
-from pp_cl.engine.raster.weights import blend_weights
-from pp_cl.engine.render import Renderer, RenderResult
+from pp_cl.engine.render import PAPER_DEPTH_RANGE, Renderer, RenderResult
 from pp_cl.reference import dense
 from pp_cl.settings import RasterConfig
 
@@ -35,36 +31,27 @@ CHANNELS = 16
 HIGHER_SH = 0.1
 
 
-class GridScene:
-    """About n discs of the paper's radius on a grid inside the unit ball, seen along none of its
-    axes, under 40 degrees. positions: (N, 3). opacity: (N,) in [0.7, 1], as in a trained model.
+class Scene:
+    """Discs of the paper's radius, and the stages that render them. positions: (N, 3). opacity:
+    (N,). features: (N, 16) float32, SH coefficients of degree 0; those above are HIGHER_SH.
     """
 
-    footprint, depth_range = "disc", (2.0, 6.0)
+    depth_range: tuple[float, float]
+    camera: Camera
+    positions: np.ndarray
+    opacity: np.ndarray
 
-    def __init__(self, dev: Device, n: int, size: int):
-        rng = np.random.default_rng(0)
+    def build(self, dev: Device, grid: Grid, cloud: PointCloud, radius: float, size: int) -> None:
+        """Make the model and its renderers. radius: as raster.radius has it."""
+        rng = np.random.default_rng(1)
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
-        voxel_size = (4 / 3 * np.pi / n) ** (1 / 3)
-        side = int(2 / voxel_size) + 2
-        grid = Grid((-voxel_size * (side - 1) / 2,) * 3, voxel_size, (side,) * 3)
-        squares = (grid.origin[0] + voxel_size * np.arange(side)) ** 2
-        inside = squares[:, None, None] + squares[:, None] + squares < 1
-        ids = np.flatnonzero(inside).astype(np.uint32)
-        self.positions, n = grid.positions(ids), len(ids)
-        focal = size / (2 * np.tan(np.radians(20)))
-        eye = 2.4, -1.6, np.sqrt(16 - 2.4**2 - 1.6**2)
-        self.camera = Camera.look_at(eye, (0, 0, 0), fx=focal, width=size, height=size)
-
         net = UNet(dev, widths=(CHANNELS,) * 3)
-        self.opacity = rng.uniform(0.7, 1, n).astype(np.float32)
-        self.cloud = PointCloud.create(dev, ids, opacity=self.opacity)
-        model = Model(dev, grid, self.depth_range, self.cloud, net=net)
-        self.sh_0 = rng.standard_normal((n, 1, CHANNELS), np.float32)
-        self.cloud.sh[0].set(self.sh_0)
-        for coefficients in self.cloud.sh[1:]:
+        model = Model(dev, grid, self.depth_range, cloud, net=net)
+        self.sh_0 = rng.standard_normal((cloud.count, 1, CHANNELS), np.float32)
+        cloud.sh[0].set(self.sh_0)
+        for coefficients in cloud.sh[1:]:
             dev.fill(coefficients, HIGHER_SH)
-        disc = RasterConfig(footprint="disc", radius=RADIUS, early_stop=0.0)
+        disc = RasterConfig(footprint="disc", radius=radius, early_stop=0.0)
         self.renderers = {b: Renderer(dev, model, replace(disc, blend=b)) for b in BLENDS}
 
     def forward(self, blend: str) -> RenderResult:
@@ -82,70 +69,50 @@ class GridScene:
         return dense.shade(self.positions, self.camera.eye, coefficients)
 
 
-class PulsarScene:
-    """The scene of Pulsar's own benchmark: n opaque spheres in a cube at a depth of 1 to 2."""
+class GridScene(Scene):
+    """About n points on a grid inside the unit ball, seen along none of its axes, under 40 degrees,
+    with opacities in [0.7, 1], as in a trained model.
+    """
 
-    footprint, depth_range = "sphere", (0.6, 2.5)
+    depth_range = 2.0, 6.0
 
     def __init__(self, dev: Device, n: int, size: int):
         rng = np.random.default_rng(0)
-        self.dev, self.size = dev, (size, size)
-        self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
+        voxel_size = (4 / 3 * np.pi / n) ** (1 / 3)
+        side = int(2 / voxel_size) + 2
+        grid = Grid((-voxel_size * (side - 1) / 2,) * 3, voxel_size, (side,) * 3)
+        squares = (grid.origin[0] + voxel_size * np.arange(side)) ** 2
+        inside = squares[:, None, None] + squares[:, None] + squares < 1
+        ids = np.flatnonzero(inside).astype(np.uint32)
+        self.positions, n = grid.positions(ids), len(ids)
+        focal = size / (2 * np.tan(np.radians(20)))
+        eye = 2.4, -1.6, np.sqrt(16 - 2.4**2 - 1.6**2)
+        self.camera = Camera.look_at(eye, (0, 0, 0), fx=focal, width=size, height=size)
+
+        self.opacity = rng.uniform(0.7, 1, n).astype(np.float32)
+        self.build(dev, grid, PointCloud.create(dev, ids, opacity=self.opacity), RADIUS, size)
+
+
+class PulsarScene(Scene):
+    """The places of Pulsar's own benchmark: n opaque points in a cube at a depth of 1 to 2; here
+    they are discs of the radius of its spheres.
+    """
+
+    depth_range = 0.6, 2.5
+
+    def __init__(self, dev: Device, n: int, size: int):
+        rng = np.random.default_rng(0)
         self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
         self.opacity = np.ones(n, np.float32)
         self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
-        self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.buffers, self.capacity = {blend: Buffers(dev) for blend in BLENDS}, 1
-        self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
-        self.point_radius = dev.upload(np.full(n, RADIUS), np.float32)
-        self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
-        self.device_features = dev.upload(self.point_features)
-        self.features = dev.empty((size, size, CHANNELS))
-
-    def forward(self, blend: str) -> RenderResult:
-        """Project, find pairs, weigh and blend."""
-        dev, b, camera, size = self.dev, self.buffers[blend], self.camera_buffer, self.size
-        with dev.stage("project"):
-            points = project_spheres(
-                dev, b, self.footprint, camera, self.point_positions, point_radius=self.point_radius
-            )
-        with dev.stage("pairs"):
-            pairs = find_all_pairs(dev, b, points, size, self.capacity)
-            self.capacity = pairs.capacity
-        with dev.stage("weights"):
-            opacity = self.point_opacity
-            weights = blend_weights(dev, b, points, pairs, opacity, blend=blend, gamma=GAMMA)
-            weights.read_count(dev)
-        with dev.stage("blend"):
-            features = gather_rows(dev, self.device_features, weights.visible)
-            blend_forward(dev, b, pairs, weights, features, self.features)
-        result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
-        result.visible_features, result.features = features, self.features
-        return result
-
-    def backward(self, blend: str, result: RenderResult) -> None:
-        """Gradients of features and opacities, then of positions and radii."""
-        dev, opacity = self.dev, self.point_opacity
-        view = result.points, result.pairs, result.weights
-        with dev.stage("backward"):
-            gradients = blend_backward(
-                dev,
-                self.buffers[blend],
-                *view,
-                visible_features=result.visible_features,
-                features=result.features,
-                grad_features=self.grad,
-            )
-        with dev.stage("spheres"):
-            spheres_backward(dev, *view, gradients.pair_gradient, opacity=opacity, gamma=GAMMA)
-
-    def exact_features(self) -> np.ndarray:
-        """(N, 16) float64 features of the points."""
-        return self.point_features.astype(np.float64)
+        grid = Grid((0.0, 0.0, 0.0), 4.0, (1, 1, 1))  # all lie in its one cell
+        cloud = PointCloud.create(dev, np.zeros(n, np.uint32), opacity=self.opacity)
+        cloud.offset.set(np.pad(self.positions / np.float32(grid.voxel_size), ((0, 0), (0, 1))))
+        near, far = self.depth_range
+        self.build(dev, grid, cloud, RADIUS * PAPER_DEPTH_RANGE / (far - near), size)
 
 
-Scene = GridScene | PulsarScene
-SCENES: dict[str, type[Scene]] = {"grid": GridScene, "pulsar": PulsarScene}
+SCENES: dict[str, type[GridScene] | type[PulsarScene]] = {"grid": GridScene, "pulsar": PulsarScene}
 
 
 def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
@@ -154,7 +121,7 @@ def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
     count.
     """
     geometry = dense.geometry(
-        scene.camera, scene.positions, RADIUS, scene.footprint, depth_range=scene.depth_range
+        scene.camera, scene.positions, RADIUS, "disc", depth_range=scene.depth_range
     )
     clear = (geometry["margin"] >= ROUNDING * scene.camera.fx).all(axis=0)
     point_features = scene.exact_features()
@@ -188,7 +155,7 @@ def bench_raster(
                 stage: float(np.median([sum(taken[stage]) for taken in passes])) * 1e3
                 for stage in passes[0]
             }
-            backward = sum(stages.get(stage, 0) for stage in ("backward", "spheres"))
+            backward = stages["backward"]
             result = scene.forward(blend)
             yield {
                 "scene": name,

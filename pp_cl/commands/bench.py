@@ -61,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene",
         metavar="SCENE",
         help="what is timed. raster: made points, grid (discs on a grid, the default) or pulsar"
-        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default); of a"
-        " run: where its scene is now",
+        " (discs at the places of Pulsar's benchmark); train: the folder of a scene, or the word"
+        " demo (default); of a run: where its scene is now",
     )
     add(
         "--points",

@@ -14,9 +14,8 @@ from pp_cl.checkpoint import opened_run
 from pp_cl.config import Given, scene_config
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
-from pp_cl.engine.layers.tiles import tiles_with
 from pp_cl.engine.network.layers import multiplications, unet_layers
-from pp_cl.engine.raster.weights import listed_fragments
+from pp_cl.engine.raster.weights import ALL
 from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
@@ -110,24 +109,24 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
     """The work for a view of a run and for a training step, as means over some training views:
     {"views", "fragments": {"found", "blended"}, "drawn": points; "step", for the crop in the middle
     of the view, or all of a smaller view: {"side", "touched": points that get gradients,
-    "with_gradients": fragments}; "network": {"tiles": share with fragments, "multiplications",
+    "with_gradients": fragments}; "network": {"tiles": share that shows points, "multiplications",
     "whole": multiplications for the whole image}}. Raises UserError as load() does.
     """
     run = load(folder.path, dev)
     renderer, network = run.renderer, run.config.network
     layers = unet_layers(network.widths, blocks=network.blocks)
-    side, rows = run.config.train.crop, []
+    side, tracked, rows = run.config.train.crop, run.config.raster.max_tracked, []
     for camera in evenly(run.cameras("train"), WORK_VIEWS):
         image = renderer.forward(camera, run.gamma)
         size, computed = image.size, image.computed_fraction
         del image  # frees its arrays before the next forward()
-        fragments, blended, drawn, tiles = _counted(
-            renderer.forward(camera, run.gamma, until="weights")
-        )
+        view = renderer.forward(camera, run.gamma, until="weights")
+        fragments, blended, drawn, tiles = _counted(view, tracked)
+        del view
         width, height = (min(side or n, n) for n in (camera.width, camera.height))
         left, top = (camera.width - width) // 2, (camera.height - height) // 2
         crop = camera.crop(left, top, width, height)
-        step = _counted(renderer.forward(crop, run.gamma, until="weights"))
+        step = _counted(renderer.forward(crop, run.gamma, until="weights"), tracked)
         whole = multiplications(layers, *size)
         rows.append([fragments, blended, drawn, tiles, *step[1:3], whole * computed, whole])
     means = np.mean(rows, axis=0).tolist()
@@ -141,17 +140,15 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
     }
 
 
-def _counted(result):
+def _counted(result, tracked):
     """[fragments found, fragments blended (before the early stop and tracked), their points, share
-    of the tiles that have fragments] of a view rendered up to its weights.
+    of the network's tiles that show points] of a view rendered up to its weights. tracked:
+    raster.max_tracked.
     """
-    pairs, weights = result.pairs, result.weights
-    offset = pairs.pixel_offset.get().astype(np.int64)
-    is_listed, _, _ = listed_fragments(pairs, weights)
-    rank = np.arange(pairs.total) - np.repeat(offset[:-1], np.diff(offset))
-    blended = is_listed & (rank < weights.tracked)
-    covered = tiles_with((np.diff(offset) > 0).reshape(result.size))
-    return [pairs.total, blended.sum(), weights.total, covered.mean()]
+    found, shown = result.fragments()
+    blended = np.minimum(shown, tracked or ALL)
+    covered = result.weights.is_covered.get() != 0
+    return [found.sum(), blended.sum(), result.weights.total, covered.mean()]
 
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:

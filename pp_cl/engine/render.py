@@ -1,7 +1,7 @@
 """The renderer: renders a model for a camera and computes gradients from the image's. Only this
 module sets the order of the stages.
 
-project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
+project -> pairs of points and tiles -> blend weights -> shade the visible points -> blend -> U-Net
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.layers.simple import specular_forward
-from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
     BlendGradients,
@@ -27,15 +26,16 @@ from pp_cl.engine.raster.blend import (
     shade_forward,
 )
 from pp_cl.engine.raster.footprint import FOOTPRINTS
-from pp_cl.engine.raster.highest_weights import list_weights, record_weights
+from pp_cl.engine.raster.fragments import count_fragments
+from pp_cl.engine.raster.highest_weights import record_weights
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
-from pp_cl.engine.raster.project import ProjectedPoints, project_grid, projection_table
-from pp_cl.engine.raster.weights import (
-    ALL,
-    BlendWeights,
-    blend_weights,
-    weights_table,
+from pp_cl.engine.raster.project import (
+    ProjectedPoints,
+    project_grid,
+    projection_table,
+    tiles_of,
 )
+from pp_cl.engine.raster.weights import BlendWeights, blend_weights, weights_table
 from pp_cl.errors import UserError
 from pp_cl.settings import RasterConfig
 
@@ -56,13 +56,14 @@ def point_radius(
 
 def is_supersampled(settings: RasterConfig) -> bool:
     """Whether a pixel can have several samples: only with discs composited by alpha."""
-    return settings.blend == "alpha" and FOOTPRINTS[settings.footprint].is_flat
+    return settings.blend == "alpha" and FOOTPRINTS[settings.footprint].is_disc
 
 
 def view_table(
+    dev: Device,
     settings: RasterConfig,
     n: int,
-    pixels: int,
+    size: tuple[int, int],
     pairs: int,
     visible: int,
     *,
@@ -70,19 +71,23 @@ def view_table(
     training: bool = False,
     supersampling: int = 1,
 ) -> Table:
-    """The buffers of Renderer for a view of n points with these numbers of pixels, fragments
-    (pairs) and visible points. until, training: as in forward(); "weights" includes the buffers of
-    record_weights(), training those of backward(). supersampling: as in RenderResult.
+    """The buffers of Renderer for a view of n points in an image of size (height, width), with
+    these numbers of pairs and of visible points. until, training: as in forward(); "weights"
+    includes the buffers of record_weights(), training those of backward(). supersampling: as in
+    RenderResult.
     """
-    table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs, supersampling)
-    table |= weights_table(n, pixels, pairs if training else 0, supersampling)
-    table["features"] = (pixels, 16), np.float32
-    if until == "weights":
-        return table | {"pair_gradient": ((pairs, 2), np.float32)}
+    records, side = until == "weights", supersampling
+    (rows, columns), kind = tiles_of(size, side), (settings.blend, settings.footprint)
+    recorded = pairs if records else 0
+    table = projection_table(n, settings.footprint)
+    table |= pairs_table(dev, n, size, pairs, side, by_point=training or records)
+    table |= weights_table(n, size, settings.blend, side, derivatives=training, pairs=recorded)
+    table["features"] = (*size, 16), np.float32
+    if records:
+        return table
     table["visible_features"] = (visible, 16), np.float32
     if training:
-        kind = settings.blend, settings.footprint
-        table |= blend_backward_table(visible, pixels, pairs, *kind, supersampling)
+        table |= blend_backward_table(visible, pairs, rows * columns, *kind)
     return table
 
 
@@ -93,7 +98,7 @@ class RenderResult:
 
     camera: the view's. size: (H, W) of the rendered image, padded to multiples of 4. offset: (left,
     top) of the view in the padded image. points: the N points as the camera sees them. tile_mask:
-    (rows, columns) bool, the 4x4 tiles of pixels that have fragments; None if the network computes
+    (rows, columns) bool, the 4x4 tiles of pixels that show points; None if the network computes
     all tiles. supersampling: samples of a pixel along each axis. visible_features: float32, one row
     of 16 for each point of weights.visible, then unused rows. features: (H, W, 16) float32, blended
     from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the network's
@@ -117,7 +122,7 @@ class RenderResult:
     @property
     def transmittance(self) -> Array | None:
         """(H * W,) float32: weights.transmittance; None with the softmax."""
-        return self.weights.transmittance
+        return self.weights.transmittance if self.weights.blend == "alpha" else None
 
     def specular_arguments(self, extent: float) -> dict[str, Any]:
         """The arguments, by name, with which a kernel computes the inputs of the specular layer:
@@ -130,15 +135,16 @@ class RenderResult:
             "camera": self.points.camera_buffer,
             "transmittance": self.transmittance,
             "features": self.features,
-            "pixel_offset": self.pairs.pixel_offset,
-            "pair_key": self.pairs.pair_key,
-            "pixel_weight_point": self.weights.pixel_weight_point,
+            "mean_range": self.weights.mean_range,
         }
 
-    def fragments(self) -> np.ndarray:
-        """(height, width) int64: the number of fragments of each pixel, without the padding."""
-        counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
-        return self.cropped(counts.reshape(self.size))
+    def fragments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two (height, width) int64: the number of fragments of each pixel, and of those that are
+        not dropped, without the padding.
+        """
+        counts = count_fragments(self.dev, self.points, self.pairs, self.weights)
+        found, shown = map(self.cropped, counts)
+        return found, shown
 
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
@@ -251,9 +257,8 @@ class Renderer:
                 side=side,
             )
         is_planned = net.is_planned(size)
-        pairs, weights, tile_mask = self._pairs_and_weights(
-            points, size, gamma, early_stop, training, times_seen, is_planned
-        )
+        options = gamma, early_stop, training, until == "weights", times_seen
+        pairs, weights, tile_mask = self._pairs_and_weights(points, size, is_planned, *options)
         view = camera, (left, top), size
         result = RenderResult(dev, *view, points, pairs, weights, tile_mask, side)
         if until == "weights":
@@ -268,7 +273,7 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blend_forward(dev, b, pairs, weights, b.visible_features, b.features)
+            blend_forward(dev, b, points, pairs, weights, b.visible_features, b.features)
         result.visible_features, result.features = b.visible_features, b.features
         if until == "features":
             return result
@@ -284,7 +289,9 @@ class Renderer:
                 specular_forward(dev, specular.parameters, result.image, of_view)
         return result
 
-    def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):
+    def _pairs_and_weights(
+        self, points, size, is_planned, gamma, early_stop, training, records, times_seen
+    ):
         """(Pairs, BlendWeights, RenderResult.tile_mask or None unless is_planned). Both stages are
         enqueued before the number of pairs is known, and run again with more capacity if it was too
         small.
@@ -292,7 +299,8 @@ class Renderer:
         settings, capacity, b = self.settings, self._capacities[self._by_pair], self._buffers
         while True:
             with self.dev.stage("pairs"):
-                pairs = find_pairs(self.dev, b, points, size, capacity.pairs, times_seen)
+                by_point = training or records
+                pairs = find_pairs(self.dev, b, points, size, capacity.pairs, times_seen, by_point)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
                 weights = blend_weights(
@@ -300,17 +308,15 @@ class Renderer:
                     b,
                     points,
                     pairs,
-                    points.point_opacity,
                     blend=settings.blend,
                     gamma=gamma if settings.blend == "softmax" else 1.0,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
+                    records=records,
                 )
                 weights.read_count(self.dev)
-            tile_mask = None
-            if is_planned:
-                tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
+            tile_mask = weights.read_covered(self.dev) if is_planned else None
             (tile_mask or weights.count).get()  # the host's only wait for the device
             capacity.pairs = capacity_needed(pairs)
             if capacity.pairs == pairs.capacity:
@@ -340,7 +346,7 @@ class Renderer:
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
         alpha compositing also from dL/dalpha (H * W,), and from the distortion loss of each sample
-        times distortion_weight (cl/raster/alpha.cl). with_offsets: also compute gradients of
+        times distortion_weight (cl/raster/blend.cl). with_offsets: also compute gradients of
         offsets, if soft points or Gaussians are composited by alpha. depth_gradient, max_weight: as
         for blend_backward().
 
@@ -375,8 +381,8 @@ class Renderer:
         result: from the last forward(training=True).
         """
         self.dev.write(result.visible_features[: len(features)], features)
-        view = result.pairs, result.weights, result.visible_features, result.features
-        blend_forward(self.dev, self._buffers, *view)
+        view = result.points, result.pairs, result.weights
+        blend_forward(self.dev, self._buffers, *view, result.visible_features, result.features)
         return result.cropped(self.dev.download(result.features))
 
     def gather(self, result: RenderResult, pixels: np.ndarray) -> np.ndarray:
@@ -385,7 +391,8 @@ class Renderer:
         """
         padded = np.zeros((*result.size, 16), np.float32)
         result.cropped(padded)[:] = pixels
-        result.weights = replace(result.weights, tracked=ALL)
+        weights = result.weights  # of all fragments
+        result.weights = replace(weights, sample_tracked=weights.sample_end)
         gradients = self.backward_features(result, self.dev.upload(padded))
         return self.dev.download(gradients.visible_features[: result.weights.visible.size])
 
@@ -397,10 +404,11 @@ class Renderer:
         *,
         least: float = 0.0,
     ) -> None:
-        """Update max_weight and times_seen by the last forward(), as highest_weights.py has it."""
-        pairs, weights = result.pairs, result.weights
-        listed = list_weights(self.dev, self._buffers, pairs, weights)
-        record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)
+        """Update max_weight and times_seen by the last forward(until="weights"), as
+        highest_weights.py has it.
+        """
+        view = result.pairs, result.weights
+        record_weights(self.dev, *view, max_weight, times_seen, least)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of a camera, clamped to [0, 1]. options: for forward()."""

@@ -200,7 +200,7 @@ class Trainer:
 
     def _depth_gradient(self, rendered, weight):
         """The gradient of weight times the depth loss, for Renderer.backward()."""
-        view = rendered.points, rendered.pairs, rendered.weights, rendered.size
+        view = rendered.points, rendered.weights, rendered.size
         of_loss = {"voxel_size": self.model.grid.voxel_size, "weight": weight}
         return depth_gradient(self.dev, self._depth_buffers, *view, **of_loss)
 

@@ -1,5 +1,6 @@
-"""Float64 twins of project, pairs, blend and shade, which compute every point at every pixel, as
-(N, HW) matrices.
+"""Float64 twins of project, blend and shade, which compute every point at every pixel, as (N, HW)
+matrices. Pulsar's spheres exist only here: the twins are compared with Pulsar itself, and the
+kernels, for discs and Gaussians, with the twins.
 """
 
 from typing import Any
@@ -11,6 +12,7 @@ Arrays = dict[str, np.ndarray]
 EPS = 1e-6
 DEPTH_RANGE = (2.0, 6.0)  # (near, far) if a test gives no other
 LEAST_RADIUS = 0.75
+LEAST_STOP, LEAST_THROUGH = 1e-20, 2.0**-24  # of alpha compositing
 LOW_PASS, DEVIATIONS, LEAST_ALPHA, MOST_ALPHA = 0.3, 3.33, 1 / 255, 0.99  # of Gaussians
 
 
@@ -236,8 +238,9 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["falloff"]
     shows = alpha_ >= least_alpha
     alpha_ = np.where(shows, np.minimum(alpha_, most_alpha), 0)
+    through = np.maximum(1 - alpha_, LEAST_THROUGH)
     factors = np.ones((len(fragment) + 1, fragment.shape[1]))  # by places, from 1
-    np.put_along_axis(factors, ranks + 1, np.where(fragment, 1 - alpha_, 1), axis=0)
+    np.put_along_axis(factors, ranks + 1, np.where(fragment, through, 1), axis=0)
     passed = np.cumprod(factors, axis=0)  # T in front of each
     through = np.take_along_axis(passed, ranks, axis=0)
     used = fragment & ~(through < least)
@@ -255,9 +258,9 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
 def blend_by_rule(
     rule: str, geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0
 ) -> Arrays:
-    """alpha() or blend(). rule: "alpha" or "softmax"."""
+    """alpha(), which stops at LEAST_STOP at the latest, or blend(). rule: "alpha" or "softmax"."""
     if rule == "alpha":
-        return alpha(geometry_, opacity, stop)
+        return alpha(geometry_, opacity, max(stop, LEAST_STOP))
     return blend(geometry_, opacity, gamma, stop)
 
 
@@ -303,6 +306,20 @@ def gradients(
         derivative = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))
     used = tracked(geometry_, blend_, max_tracked)
     return np.where(used, blend_["weight"], 0) @ G, np.where(used, derivative, 0).sum(axis=1)
+
+
+def by_falloff(
+    geometry_: Arrays,
+    blend_: Arrays,
+    opacity: np.ndarray,
+    point_features: np.ndarray,
+    grad_features: np.ndarray,
+) -> np.ndarray:
+    """(N, HW) dL/dd of alpha compositing, given grad_features (HW, C)."""
+    G = np.asarray(grad_features, np.float64)
+    own = np.asarray(point_features, np.float64) @ G.T
+    derivative = _alpha_derivative(blend_, own, G.sum(axis=1), order(geometry_))
+    return np.asarray(opacity, np.float64)[:, None] * derivative
 
 
 def tracked(geometry_: Arrays, blend_: Arrays, max_tracked: int) -> np.ndarray:

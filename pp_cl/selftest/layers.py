@@ -246,17 +246,12 @@ def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray,
 
 
 def _tiles(dev, rng):
-    """Tiles that differ from the background, tiles that have fragments, and copies of tiles, also
-    at the border.
-    """
+    """Tiles that differ from the background, and copies of tiles, also at the border."""
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
         differing, naive = tiles.tiles_find(dev, dev.upload(x), 1.0).get(), np.abs(x - 1) > 0
         yield exact(differing, halve((x != 1).any(2), 2), naive=halve(naive.any(2), 2))
-        fragments = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
-        offsets = dev.upload(np.concatenate([[0], np.cumsum(fragments)]), np.uint32)
-        yield exact(tiles.tiles_covered(dev, offsets, (h, w)).get(), halve(fragments > 0, 2))
         yield _copied_tiles(dev, rng, _normal(rng, h, w, c))
 
 

@@ -112,9 +112,10 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     """Points (N, 3) in camera axes as a view has them, without its other arrays."""
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
-    rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = (dev.zeros((1,)),) * 6
-    return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
+    rows = np.zeros((len(positions), 8), np.float32)
+    rows[:, :4] = np.column_stack([towards @ camera.pose[:, :3], distance])
+    record, absent = dev.upload(rows.view(np.uint32)), (dev.zeros((1,)),) * 3
+    return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), record, *absent, 0.0)
 
 
 def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int = 4) -> Gradients:

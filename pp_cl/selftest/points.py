@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
-from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.engine.camera import Camera, look_at
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward
+from pp_cl.engine.raster.fragments import Fragments, list_fragments
+from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs
 from pp_cl.engine.raster.points import OPACITIES
-from pp_cl.engine.raster.project import project_grid
-from pp_cl.engine.raster.weights import blend_weights, listed_fragments
+from pp_cl.engine.raster.project import ProjectedPoints, project_grid
+from pp_cl.engine.raster.weights import BlendWeights, blend_weights
 from pp_cl.reference import dense
 
 Gradients = dict[str, np.ndarray]
@@ -45,11 +46,30 @@ def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
     return rng.uniform(least, 1, (n, OPACITIES)).astype(np.float32)
 
 
+def find_all_pairs(
+    dev: Device,
+    b: Buffers,
+    points: ProjectedPoints,
+    size: tuple[int, int],
+    times_seen: Array | None = None,
+) -> Pairs:
+    """find_pairs() by point, with room for all pairs."""
+    capacity = 1
+    while True:
+        pairs = find_pairs(dev, b, points, size, capacity, times_seen, by_point=True)
+        pairs.read_count(dev)
+        capacity = capacity_needed(pairs)
+        if capacity == pairs.capacity:
+            return pairs
+        del pairs  # frees its arrays before the larger ones are made
+
+
 class PairedPoints:
-    """Points (N, 3) with one radius or (N,), projected and paired with a camera's pixels, or with
-    pixels of side x side samples.
+    """Points (N, 3) with one radius or (N,), projected and paired with the tiles of a camera's
+    image, or of one of pixels with side x side samples. exact(): dense.geometry() of them.
     """
 
+    weights: BlendWeights  # from the last blend()
     backward: BlendGradients  # from the last gradients()
 
     def __init__(
@@ -63,62 +83,85 @@ class PairedPoints:
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
         side: int = 1,
     ):
-        exact = partial(dense.geometry, camera, positions, radius, kind, depth_range=depth_range)
-        buffers, n = Buffers(dev), len(positions)
-        projected = project_spheres(
-            dev,
-            buffers,
-            kind,
-            dev.upload(camera.packed(depth_range)),
-            dev.upload(positions, np.float32),
-            point_radius=dev.upload(np.broadcast_to(radius, n), np.float32),
-            side=side,
-        )
-        self._pair(dev, camera, n, exact, depth_range, buffers, projected)
+        n, largest = len(positions), float(np.max(radius))
+        exact = partial(dense.geometry, camera, positions, kind=kind, depth_range=depth_range)
+        exact = partial(exact, radius=radius)
+        if kind == "gaussian":  # culled by their common radius
+            spread = np.square(np.broadcast_to(radius, n).astype(np.float64))[:, None, None]
+            exact = partial(exact, radius=largest, covariance=spread * np.eye(3))
+        offset = np.zeros((n, 16 if kind == "gaussian" else 4), np.float32)
+        # all lie in one cell, whose size divides without a rounding
+        near = np.abs(positions)[np.abs(positions) < 1e6].max(initial=1)
+        size = 2.0 ** np.ceil(np.log2(2 * near))
+        offset[:, :3] = np.asarray(positions, np.float32) / np.float32(size)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if np.ndim(radius):
+                offset[:, 3] = np.log(np.asarray(radius, np.float64) / largest)
+            if kind == "gaussian":
+                offset[:, 4] = offset[:, 5] = offset[:, 3]
+        grid = Grid((0.0, 0.0, 0.0), float(size), (1, 1, 1))
+        ids = np.zeros(n, np.uint32)
+        view = depth_range, grid, ids, offset, largest
+        self._set(dev, camera, kind, side, exact, *view)
 
-    def _pair(self, dev, camera, n, exact, depth_range, buffers, projected):
-        self.dev, self.camera, self.n, self.buffers = dev, camera, n, buffers
-        self._exact, self.depth_range = exact, depth_range
-        self.shape = camera.height // projected.side, camera.width // projected.side
-        self.projected = projected
-        self.times_seen = dev.zeros((n,))
-        self.pairs = find_all_pairs(dev, buffers, projected, self.shape, times_seen=self.times_seen)
+    def _set(self, dev, camera, kind, side, exact, depth_range, grid, ids, offset, radius):
+        self.dev, self.camera, self.n, self.buffers = dev, camera, len(ids), Buffers(dev)
+        self.exact, self.depth_range = exact, depth_range
+        self.shape = camera.height // side, camera.width // side
+        self._view = kind, dev.upload(camera.packed(depth_range)), dev.upload(grid.packed())
+        self._points = {
+            "point_id": dev.upload(ids, np.uint32),
+            "cloud_offset": dev.upload(offset, np.float32),
+            "radius": radius,
+            "side": side,
+        }
+        self._project(np.zeros(self.n))
+        self.times_seen = dev.zeros((self.n,))
+        shared = dev, self.buffers, self.projected
+        self.pairs = find_all_pairs(*shared, self.shape, self.times_seen)
+        options = {"blend": "alpha", "gamma": 1.0, "early_stop": 0.0}
+        weights = blend_weights(*shared, self.pairs, **options)
+        #: all fragments, of which none is opaque
+        self.listed: Fragments = list_fragments(dev, self.projected, self.pairs, weights)
+
+    def _project(self, opacity):
+        opacities = np.zeros((self.n, OPACITIES), np.float32)
+        opacities[:, 0] = opacity
+        of_points = self._points | {"opacity": self.dev.upload(opacities)}
+        self.projected = project_grid(self.dev, self.buffers, *self._view, **of_points)
 
     @property
     def seen(self) -> np.ndarray:
-        """(?,) indices of the points that have a pair, ascending."""
-        return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
+        """(?,) indices of the points that have a fragment, ascending."""
+        return np.unique(self.listed.point)
 
-    def pair_points(self) -> np.ndarray:
-        """(P,) the point of each pair, computed from the offsets alone."""
-        counts = np.diff(self.pairs.point_offset.get().astype(np.int64))
-        return np.repeat(np.arange(self.n), counts)
-
-    def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
-        """(N, HW) array of the pairs' values, (P, ...) on the host."""
-        total = self.pairs.total
-        pixels = self.camera.width * self.camera.height
-        matrix = np.full((self.n, pixels), missing, pair_values.dtype)
-        matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
+    def dense(self, values: np.ndarray, missing: float = 0.0) -> np.ndarray:
+        """(N, HW) array of the values of the fragments as listed."""
+        matrix = np.full((self.n, self.shape[0] * self.shape[1]), missing, values.dtype)
+        matrix[self.listed.point, self.listed.pixel] = values
         return matrix
+
+    def depths(self) -> np.ndarray:
+        """(N,) float32, the depths by which points are sorted; 0 for points without pairs."""
+        keys = self.pairs.pair_key.get()[: self.pairs.total]
+        depths = np.zeros(self.n, np.float32)
+        depths[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
+        return depths
 
     def geometry(self) -> dict[str, np.ndarray]:
         """dense.geometry() with the device's fragments, falloff and depth, since a falloff at the
         rim of a footprint is rounding, which a softmax may turn into half a pixel.
         """
-        total, fragment = self.pairs.total, self.fragments()
-        falloff = self.pairs.pair_point_falloff.get()[:total, 1].view(np.float32)
-        keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
-        depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
-        geometry = self._exact()
+        fragment, geometry = self.fragments(), self.exact()
+        falloff, depth = self.dense(self.listed.falloff), self.depths()[:, None]
         for name, measured in (("falloff", falloff), ("depth", depth)):
-            geometry[name] = np.where(fragment, self.dense(measured), geometry[name])
+            geometry[name] = np.where(fragment, measured, geometry[name])
         near, far = self.depth_range
         return geometry | {"fragment": fragment, "z": 1 - (geometry["depth"] - near) / (far - near)}
 
     def fragments(self) -> np.ndarray:
         """(N, HW) bool: the pixels that each point covers."""
-        return self.dense(np.ones(max(1, self.pairs.total), bool), False)
+        return self.dense(np.ones(len(self.listed.point), bool), False)
 
     def blend(
         self,
@@ -130,33 +173,29 @@ class PairedPoints:
         **drops: Any,
     ) -> np.ndarray:
         """(H, W, 16) blended features. rule: one of BLENDS. drops: max_tracked and early_stop."""
-        self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
-        view = self.buffers, self.projected, self.pairs
-        self.weights = blend_weights(
-            self.dev, *view, self.opacity, blend=rule, gamma=gamma, **drops
-        )
+        self.gamma, self.opacity = gamma, np.asarray(opacity, np.float32)
+        self._project(self.opacity)
+        view = self.projected, self.pairs
+        options = {"blend": rule, "gamma": gamma, **drops}
+        self.weights = blend_weights(self.dev, self.buffers, *view, **options)
         self.weights.read_count(self.dev)
+        self.blended = list_fragments(self.dev, *view, self.weights)
         visible = self.weights.visible.get()
         rows = np.full((len(visible) + 1, 16), np.nan)  # with room for one more point
         rows[:-1] = np.asarray(point_features)[visible]
         self.visible_features = self.dev.upload(rows, np.float32)
         self.features = self.dev.empty((*self.shape, 16))
-        blended = self.pairs, self.weights, self.visible_features, self.features
-        blend_forward(self.dev, Buffers(self.dev), *blended)
+        arrays = self.visible_features, self.features
+        blend_forward(self.dev, Buffers(self.dev), *view, self.weights, *arrays)
         return self.features.get()
 
     def weight(self) -> np.ndarray:
         """(N, HW) blend weights, 0 for dropped fragments."""
-        return self.weight_and_dropped()[0]
+        return self.dense(self.blended.weight)
 
-    def weight_and_dropped(self) -> tuple[np.ndarray, np.ndarray]:
-        """((N, HW) blend weights, (N, HW) bool: the fragments behind an early stop)."""
-        is_listed, _, weights = listed_fragments(self.pairs, self.weights)
-        ordered = self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
-        weight, dropped = np.zeros(len(ordered), np.float32), np.empty(len(ordered), bool)
-        weight[ordered[is_listed]] = weights
-        dropped[ordered] = ~is_listed
-        return self.dense(weight), self.dense(dropped, False)
+    def dropped(self) -> np.ndarray:
+        """(N, HW) bool: the fragments behind an early stop, and Gaussians' that hardly show."""
+        return self.dense(~self.blended.shows, False)
 
     def gradients(
         self,
@@ -195,15 +234,6 @@ class PairedPoints:
             gradients[name][visible] = array.get()[: len(visible)]
         return gradients
 
-    def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
-        """gradients(), and {"positions": (N, 3), "radius": (N,)} of sum(features * grad)."""
-        gradients, view = self.gradients(grad_features), (self.projected, self.pairs, self.weights)
-        pair_gradient = self.backward.pair_gradient
-        positions, radius = spheres_backward(
-            self.dev, *view, pair_gradient, opacity=self.opacity, gamma=self.gamma
-        )
-        return gradients | {"positions": positions.get(), "radius": radius.get()}
-
 
 class PairedGaussians(PairedPoints):
     """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), as in cl/cloud.h."""
@@ -217,20 +247,10 @@ class PairedGaussians(PairedPoints):
         offset: np.ndarray,
         radius: float,
     ):
-        vertices, n, buffers = grid.positions(ids), len(ids), Buffers(dev)
+        vertices = grid.positions(ids)
         exact = partial(dense.gaussians, camera, vertices, grid.voxel_size, offset, radius)
-        projected = project_grid(
-            dev,
-            buffers,
-            "gaussian",
-            dev.upload(camera.packed(dense.DEPTH_RANGE)),
-            dev.upload(grid.packed()),
-            point_id=dev.upload(ids, np.uint32),
-            cloud_offset=dev.upload(offset, np.float32),
-            opacity=dev.zeros((n, OPACITIES)),
-            radius=radius,
-        )
-        self._pair(dev, camera, n, exact, dense.DEPTH_RANGE, buffers, projected)
+        view = dense.DEPTH_RANGE, grid, ids, offset, radius
+        self._set(dev, camera, "gaussian", 1, exact, *view)
 
 
 NEAR, FAR = dense.DEPTH_RANGE
@@ -284,7 +304,7 @@ class Blended:
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
-        self.weight, self.dropped = self.scene.weight_and_dropped()
+        self.weight, self.dropped = self.scene.weight(), self.scene.dropped()
 
     def gradients(self, distortion_weight: float = 0.0) -> Gradients:
         """The kernels' gradients of sum(features * grad) and the weighted distortion loss."""

@@ -12,9 +12,9 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
 from pp_cl.engine.raster.depth import depth_forward
 from pp_cl.engine.raster.footprint import FOOTPRINTS
-from pp_cl.engine.raster.highest_weights import list_weights, record_weights
+from pp_cl.engine.raster.highest_weights import record_weights
 from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES, sh_blocks
-from pp_cl.engine.raster.project import project_grid
+from pp_cl.engine.raster.project import TILE, project_grid
 from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite, relative
@@ -35,20 +35,15 @@ GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 PLACED = 1e-6  # a rotated difference has 8 roundings of half EPS, and the camera two of its own
 BAND = 1e-4  # pixels around the edge of a footprint in which rounding may decide
 FALLOFF = 1e-4  # a falloff in that band, with a radius of at least 0.75 pixels
-RIM = 1e-3  # the depth of a sphere is steep at its rim
 SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, divided by another sum
 SHOWN = [0, 0, 3.0], [0.001, 0, 4.0]  # positions in front of the eye of AXIS
-BY_SQUARES = {
-    "soft": "c.c - (c.r)^2 cancels",
-    "sphere": "sqrt(R^2 - w^2) where the ray misses",
-}
 
 
 def _project(dev, rng):
-    """Points in the cells of a grid, and spheres; the depth range culls some. Points in the image
-    cover a pixel, however small they are, and their places are compared.
+    """Points in the cells of a grid; the depth range culls some. Points in the image cover a pixel,
+    however small they are, and their places are compared.
     """
-    camera, depth_range = make_camera(), (3.5, 4.8)
+    camera = make_camera()
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
         ids[-1] = GRID.ids(np.array(GRID.dims) - 1)
@@ -62,20 +57,27 @@ def _project(dev, rng):
         off = np.hypot(*(u - np.floor(u) - np.float32(0.5) for u in (column, row)))
         naive = off * z < 0.01 * camera.fx  # a pixel's centre is within the disc
         yield exact(covers | beside, np.ones(n, bool), naive=naive | beside)
-        radius = 0.01 * np.exp(offset[covers, 3])
-        yield relative(points.point_shape.get()[covers, 0], radius, PLACED)
-        yield relative(points.point_camera.get()[covers, :3], place[covers], PLACED)
+        least = dense.LEAST_RADIUS * np.linalg.norm(place, axis=1) / min(camera.fx, camera.fy)
+        radius = 0.01 * np.exp(offset[:, 3])
+        size = np.where(radius < least, -least, radius)
+        found = _records(points)
+        yield relative(found[covers, 4], size[covers], PLACED)
+        yield relative(found[covers, :3], place[covers], PLACED)
         distance = np.linalg.norm(place[covers], axis=1)
-        yield relative(points.point_camera.get()[covers, 3], distance, PLACED)
+        yield relative(found[covers, 3], distance, PLACED)
 
         positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
-        spheres = PairedPoints(dev, camera, positions, radius, depth_range=depth_range)
-        placed, covers = spheres.projected.point_camera.get(), np.isin(np.arange(n), spheres.seen)
-        place = dense.camera_space(camera, positions)
-        drawn = dense.drawn(camera, positions, radius, depth_range)
+        culled = PairedPoints(dev, camera, positions, radius, depth_range=(3.5, 4.8))
+        covers = np.isin(np.arange(n), culled.seen)
+        drawn = dense.drawn(camera, positions, radius, (3.5, 4.8))
         yield exact(covers[~drawn], np.zeros((~drawn).sum(), bool))
+        place = dense.camera_space(camera, positions)
         yield exact(covers | ~(drawn & _inside(camera, place)), np.ones(n, bool))
-        yield relative(placed[covers, :3], place[covers], PLACED)
+
+
+def _records(points):
+    """(N, 8) float32: x, y, z, distance, radius and opacity of points, and bits of their boxes."""
+    return points.point_record.get()[:, :8].view(np.float32)
 
 
 def _opacities(dev, rng):
@@ -98,7 +100,7 @@ def _check_opacities(dev, camera, ids, learned):
     covers = points.point_count.get() > 0
     expected = dense.opacities(GRID.positions(ids), camera.eye, learned)
     # eight products of about 1/2 with harmonics of a direction that has four roundings
-    yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
+    yield absolute(_records(points)[covers, 5], expected[covers], 8 * EPS)
 
 
 def _far_away(dev, rng):
@@ -123,7 +125,7 @@ def _check_places(dev, camera, grid, ids, naive):
     covers, pose = points.point_count.get() > 0, camera.pose.astype(np.float32)
     expected = dense.camera_space(camera, grid.positions(ids))[covers]
     naive = (naive[covers] - pose[:, 3]) @ pose[:, :3]
-    yield relative(points.point_camera.get()[covers, :3], expected, PLACED, naive=naive)
+    yield relative(_records(points)[covers, :3], expected, PLACED, naive=naive)
 
 
 def _projected(dev, footprint, camera, ids, offset, opacity, radius, grid=GRID):
@@ -184,7 +186,7 @@ def _check_left_out(dev, positions, *, shown=None, slopes=None):
         scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
         yield exact(np.isin(np.arange(n), scene.seen), np.arange(n) < 2, naive=shown)
         features = scene.blend(np.ones(n), 0.01, np.full((n, 16), 2))
-        gradients = scene.sphere_gradients(ones) if kind == "sphere" else scene.gradients(ones)
+        gradients = scene.gradients(ones)
         yield finite(features, *gradients.values(), naive=slopes)
         yield exact(
             [gradient[2:].any() for gradient in gradients.values()], [False] * len(gradients)
@@ -192,17 +194,19 @@ def _check_left_out(dev, positions, *, shown=None, slopes=None):
 
 
 def _pairs(kind, dev, rng):
-    """The pixels that a point covers, its falloff and depth there, and the order of points."""
+    """The tiles of a point's box, the pixels that it covers, its falloff and depth there, and the
+    order of points.
+    """
     camera = replace(make_camera(33, 31), fy=26.0)
     for n in SIZES:
         positions, radius = make_points(rng, n), (10.0 ** rng.uniform(-3, 0, n)).astype(np.float32)
         scene = PairedPoints(dev, camera, positions, radius, kind=kind)
-        naive = _by_squares(kind, camera, positions, radius)
-        yield from _check_pairs(scene, dense.geometry(camera, positions, radius, kind), naive)
+        naive = _by_squares(camera, positions, radius) if kind == "soft" else None
+        yield from _check_pairs(scene, scene.exact(), naive)
 
 
-def _by_squares(kind, camera, positions, radius):
-    """{name: (N, HW) float32}, with a ray's distance from a centre computed by |c|^2 - (c.r)^2."""
+def _by_squares(camera, positions, radius):
+    """(N, HW) float32: falloffs, with a ray's distance from a centre as |c|^2 - (c.r)^2."""
     c, r = (
         array.astype(np.float32)
         for array in (dense.camera_space(camera, positions), dense.rays(camera))
@@ -211,41 +215,47 @@ def _by_squares(kind, camera, positions, radius):
     rho2 = range2 - along * along
     width = np.sqrt(range2) / np.float32(min(camera.fx, camera.fy))
     reach = np.maximum(radius[:, None], np.float32(dense.LEAST_RADIUS) * width)
-    return {
-        "soft": {"falloff": 1 - np.sqrt(rho2) / reach},
-        "sphere": {"depth": along - np.sqrt(radius[:, None] ** 2 - rho2)},
-    }.get(kind, {})
+    return 1 - np.sqrt(rho2) / reach
 
 
 def _check_pairs(scene, expected, naive):
-    """Checks that tests/engine/raster/test_pairs.py explains. naive: arrays from a formula."""
-    pairs, fragments, measured = scene.pairs, scene.fragments(), scene.geometry()
-    clear = expected["margin"] > BAND
+    """Checks of pairs and fragments. naive: falloffs from a formula."""
+    pairs, listed, fragments = scene.pairs, scene.listed, scene.fragments()
+    clear, measured = expected["margin"] > BAND, scene.geometry()
     yield exact(fragments[clear], expected["fragment"][clear])
-    yield exact(fragments.sum(), pairs.total)
-    for what, bound in (("falloff", FALLOFF), ("depth", RIM)):
-        beside = naive[what][fragments] if what in naive else None
-        yield relative(measured[what][fragments], expected[what][fragments], bound, naive=beside)
-    yield exact(pairs.pair_point_falloff.get()[: pairs.total, 0], scene.pair_points())
-    counts = np.diff(pairs.pixel_offset.get().astype(np.int64))
-    yield exact(counts, fragments.sum(axis=0))
+    beside = None if naive is None else naive[fragments]
+    falloff = measured["falloff"][fragments], expected["falloff"][fragments]
+    yield relative(*falloff, FALLOFF, naive=beside)
+    yield relative(measured["depth"][fragments], expected["depth"][fragments], PLACED)
+    counts = pairs.tile_offset.get().astype(np.int64)
     keys = pairs.pair_key.get()[: pairs.total]
-    pair = keys & 0xFFFFFFFF
-    yield exact(np.sort(pair), np.arange(pairs.total))
-    pixels = pairs.pair_pixel.get()[pair]
-    yield exact(pixels, np.repeat(np.arange(len(counts)), counts))
-    inner = pixels[1:] == pixels[:-1]
+    point, tile = keys & 0xFFFFFFFF, np.repeat(np.arange(len(counts) - 1), np.diff(counts))
+    inner = tile[1:] == tile[:-1]
     yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
-    yield exact(scene.seen, np.flatnonzero(fragments.any(axis=1)))
-    yield exact(scene.times_seen.get(), fragments.any(axis=1).astype(np.float32))
+    of_points = np.bincount(point.astype(np.int64), minlength=scene.n)
+    yield exact(of_points, scene.projected.point_count.get())
+    yield exact(np.diff(pairs.point_offset.get().astype(np.int64)), of_points)
+    # each fragment lies in a tile of its point
+    y, x = np.divmod(listed.pixel, scene.shape[1])
+    of_fragment = y // TILE * pairs.tiles[1] + x // TILE
+    is_paired = np.zeros((scene.n, len(counts) - 1), bool)
+    is_paired[point, tile] = True
+    yield exact(is_paired[listed.point, of_fragment], np.ones(len(y), bool))
+    inner = listed.pixel[1:] == listed.pixel[:-1]
+    order = np.stack([scene.depths()[listed.point], listed.point.astype(np.float64)])
+    later = (order[0, 1:] > order[0, :-1]) | (
+        (order[0, 1:] == order[0, :-1]) & (order[1, 1:] > order[1, :-1])
+    )
+    yield exact(later[inner], np.ones(inner.sum(), bool))
+    yield exact(scene.times_seen.get(), of_points > 0)
 
 
 def _equal_depths(dev, rng):
-    """Thousands of points at few depths in one pixel: a stable order."""
+    """Thousands of points at few depths in one tile, or all at one: a stable order."""
     camera = replace(AXIS, fx=30.0, fy=33.0)
-    for n in (*SIZES, 10_000):
+    for n in (*SIZES, 10_000, 100_000):
         positions = np.zeros((n, 3))
-        positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 2)
+        positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 2) if n < 100_000 else 3
         pairs, z = PairedPoints(dev, camera, positions, 0.1).pairs, positions[:, 2]
         order = np.argsort(z.astype(np.float32), kind="stable")
         naive = np.argsort(z.astype(np.float32), kind="quicksort")
@@ -259,7 +269,7 @@ def _close_depths(dev, rng):
         np.float32(3).view(np.uint32) + rng.permutation(5000).astype(np.uint32)
     ).view(np.float32)
     scene = PairedPoints(dev, AXIS, positions, 0.1)
-    depth, (near, far) = scene.geometry()["depth"][:, 0].astype(np.float32), scene.depth_range
+    depth, (near, far) = scene.depths(), scene.depth_range
     naive = np.argsort(((depth - near) / (far - near) * 65535).astype(np.uint16), kind="stable")
     order = scene.pairs.pair_key.get()[:5000] & 0xFFFFFFFF
     yield exact(order, np.argsort(depth, kind="stable"), naive=naive)
@@ -275,6 +285,22 @@ def _pixel_borders(dev, rng):
     naive = np.rint(column - 0.5) == np.arange(33)
     expected = dense.geometry(camera, positions, 1e-3, "disc")["fragment"]
     yield exact(scene.fragments(), expected, naive=naive)
+
+
+def _widest(dev, rng):
+    """The widest image that is rendered, and the narrowest: where points are in them."""
+    for width, focal in ((2**16 - 1, 30_000.0), (1, 1.0)):
+        camera = Camera(np.eye(3, 4), focal, focal, width / 2, 0.5, width, 1)
+        column = np.concatenate([[0, width - 1], rng.integers(width, size=62)]) + 0.5
+        positions = np.zeros((64, 3), np.float32)
+        positions[:, 2] = rng.uniform(2.2, 5.8, 64)
+        positions[:, 0] = (column - camera.cx) / focal * positions[:, 2]
+        scene = PairedPoints(dev, camera, positions, 1e-5, kind="disc", depth_range=(2.0, 9.0))
+        expected, listed = np.floor(column), scene.listed
+        in_centre = np.zeros(64, bool)
+        in_centre[listed.point[listed.pixel == expected[listed.point]]] = True
+        naive = expected.astype(np.uint16).view(np.int16) == expected
+        yield exact(in_centre, np.ones(64, bool), naive=naive if width > 1 else None)
 
 
 def _beside_the_eye(dev, rng):
@@ -317,14 +343,15 @@ def _shade(dev, rng):
         # nine products of a direction's squares, with 5 roundings each, of values of up to 4
         yield relative(features[:-3], expected[listed], 1e-5)
         yield exact(features[-3:], np.full((3, 16), 7))
-        gaussians = replace(scene.projected, footprint="gaussian")
+        record = dev.upload(np.pad(scene.projected.point_record.get(), ((0, 0), (0, 8))))
+        gaussians = replace(scene.projected, footprint="gaussian", point_record=record)
         clamped = shade([block.astype(np.float32) for block in sh], gaussians)
         yield exact(clamped[:-3], np.maximum(features[:-3], 0))
 
 
 def _depth(rule, dev, rng):
     """Alpha, and mean and median depth from the blend weights."""
-    for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
+    for n, kind in ((31, "soft"), (257, "soft"), (33, "disc")):
         blended = Blended(
             dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
         )
@@ -334,8 +361,10 @@ def _depth(rule, dev, rng):
         z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
         covers = total > 0
-        stopped = blended.dropped.any(axis=0)
-        yield each(alpha, np.where(stopped, 1, np.minimum(total, 1)), SUMMED, floor=1e-2)
+        stopped = blended.dropped.any(axis=0) & (rule == "alpha")
+        expected = np.where(stopped, 1, np.minimum(total, 1))
+        beyond = blended.blend["background"] < 1e-2  # stopped, though nothing was dropped
+        yield each(alpha[~beyond | stopped], expected[~beyond | stopped], SUMMED, floor=1e-2)
         yield exact(np.isinf(depth), ~covers)
         mean = (weight * z).sum(axis=0)[covers] / total[covers]
         yield relative(depth[covers], mean, SUMMED)
@@ -390,37 +419,33 @@ def _medians(blended, weight, z):
 
 
 def _depths(dev, scene, voxel_size=0.0):
-    view = scene.projected, scene.pairs, scene.weights, scene.shape
+    view = scene.projected, scene.pairs, scene.weights
     arrays = depth_forward(dev, *view, voxel_size)
     return [array.get().ravel() for array in arrays]
 
 
 def _record(rule, dev, rng):
-    """Each point's highest weight, also as the backward pass finds it, and how often it was seen,
-    from the tracked fragments.
-    """
-    drops = {"early_stop": 0.05, "max_tracked": 2}
+    """Each point's highest weight, also as the backward pass finds it, and how often it is seen."""
+    drops = {"early_stop": 0.05, "records": True}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)
     before, times_seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
-    listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen)
-    yield exact(times_seen.get() - np.arange(500), blended.geometry["fragment"].any(axis=1))
-    tracked = dense.tracked(blended.geometry, blended.blend, 2)
-    weight = np.where(tracked, blended.blend["weight"], 0).sum(axis=1)
+    view = dev, scene.pairs, scene.weights
+    record_weights(*view, highest, times_seen)
+    has_pairs = scene.projected.point_count.get() > 0
+    yield exact(times_seen.get() - np.arange(500), has_pairs)
+    weight = blended.blend["weight"].sum(axis=1)
     least = float(np.sort(weight)[-30:-28].mean())  # 29 points have a higher sum
     dev.fill(times_seen, 0)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen, least)
+    record_weights(*view, highest, times_seen, least)
     yield exact(times_seen.get(), weight > least)
-    is_visible = np.isin(scene.pair_points(), scene.weights.visible.get())
-    weights = listed.get()[: scene.pairs.total, 0][is_visible]
+    expected = np.maximum(2e-3 * np.arange(500), weight)
+    yield relative(highest.get(), expected, PLACED)
     scene.gradients(blended.grad, max_weight=before)
-    weights_left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
-    yield exact(weights_left[is_visible], weights)
-    yield relative(highest.get(), np.maximum(2e-3 * np.arange(500), weight), PLACED)
-    yield exact(before.get(), highest.get())
+    yield relative(before.get(), expected, PLACED)
 
 
+BY_SQUARES = {"soft": "c.c - (c.r)^2 cancels"}
 CASES = (
     Case("raster: project", _project, hard="only pixels whose centres it contains"),
     Case("raster: opacities by direction", _opacities),
@@ -434,6 +459,7 @@ CASES = (
         for kind in FOOTPRINTS
     ),
     Case("raster: points on pixel borders", _pixel_borders, hard="halves rounded to even"),
+    Case("raster: an image of 65,535 columns", _widest, hard="columns of 16 bits with a sign"),
     Case("raster: large points beside the eye", _beside_the_eye, hard="a box of f R / z pixels"),
     Case("raster: thousands of equal depths", _equal_depths, hard="an unstable sort"),
     Case("raster: depths one float apart", _close_depths, hard="depths sorted in 16 bits"),

@@ -11,7 +11,6 @@ from pp_cl.engine.layers.conv import pack_bias, pack_weights
 from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.network.layers import convolutions
 from pp_cl.engine.network.specular import INPUTS, Specular
-from pp_cl.engine.raster.weights import NO_POINT
 from pp_cl.engine.render import RenderResult
 from pp_cl.engine.training.specular import ROW, draw_batch, gradient_of_squares, keep_pixels
 from pp_cl.reference import network
@@ -53,38 +52,25 @@ def _view(dev, rng, height, width, side):
     features, image = rng.normal(size=(height, width, 16)), rng.random((height, width, 3))
     rays = camera.rays()
     directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    lengths = rng.integers(1, 5, height * width)
-    listed = rng.integers(1, lengths + 1)
-    offset = np.concatenate([[0], np.cumsum(lengths)])
-    pixel = np.repeat(np.arange(height * width), lengths)
-    is_listed = np.arange(offset[-1]) - offset[pixel] < listed[pixel]
-    weights, distances = (rng.uniform(*of, offset[-1]).astype(np.float32) for of in (WEIGHTS, FAR))
-    sums = (np.bincount(pixel, is_listed * x) for x in (weights, weights * np.float64(distances)))
-    mean = (1 / next(sums) * next(sums)).reshape(height, width, 1)
+    ranges = rng.uniform(*FAR, height * width).astype(np.float32)
+    mean = ranges.reshape(height, width, 1).astype(np.float64)
     view: Any = RenderResult(
         dev,
         camera,
         PADDED,
         (height, width),
         points=SimpleNamespace(camera_buffer=dev.upload(camera.enlarged(side).packed((1, 9)))),
-        pairs=SimpleNamespace(
-            pixel_offset=dev.upload(offset, np.uint32),
-            pair_key=dev.upload(_words(distances, pixel)),
-        ),
+        pairs=None,
         weights=SimpleNamespace(
+            blend="alpha",
             transmittance=dev.upload(1 - alpha.ravel(), np.float32),
-            pixel_weight_point=dev.upload(_words(weights, np.where(is_listed, pixel, NO_POINT))),
+            mean_range=dev.upload(ranges),
         ),
         tile_mask=None,
         supersampling=side,
     )
     view.features, view.image = dev.upload(features, np.float32), dev.upload(image, np.float32)
     return view, directions, (camera.eye + mean * directions) / EXTENT
-
-
-def _words(upper, lower):
-    """(?,) uint64: bits of float32 in the upper half, a number in the lower one."""
-    return upper.view(np.uint32).astype(np.uint64) << 32 | lower.astype(np.uint64)
 
 
 def _forward(dev, rng):

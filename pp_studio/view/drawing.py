@@ -52,7 +52,7 @@ def draw(
         # the whole view: until="weights" would change buffers with which a training goes on
         between = run.depth_range(camera)
         whole = run.renderer.forward(camera, run.gamma, early_stop=early_stop, depth_range=between)
-        counts = whole.fragments()
+        counts, _ = whole.fragments()
         image = colour_scale(counts, 0, counts.max(), counts > 0)
         line = f"0 to {counts.max()} fragments"
     else:

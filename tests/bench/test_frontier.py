@@ -12,7 +12,7 @@ from pp_cl.bench import frontier
 from pp_cl.bench.frontier import Renderings, fastest_row, frame, measured, visibility
 from pp_cl.bench.plots import plot_frontier
 from pp_cl.cli import main
-from pp_cl.engine.raster.weights import listed_fragments
+from pp_cl.engine.raster.fragments import list_fragments
 from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate_run
 from pp_cl.run import load
@@ -175,8 +175,8 @@ def test_visibility_is_the_sum_of_the_blend_weights(run):
     expected = np.zeros(run.model.cloud.count)
     for camera in run.cameras("train"):
         drawn = run.renderer.forward(camera, run.gamma, until="weights")
-        _, point, weight = listed_fragments(drawn.pairs, drawn.weights)
-        np.add.at(expected, point, weight)
+        listed = list_fragments(run.dev, drawn.points, drawn.pairs, drawn.weights)
+        np.add.at(expected, listed.point, listed.weight)
     np.testing.assert_allclose(visibility(run), expected, rtol=1e-5)
 
 

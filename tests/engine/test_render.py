@@ -42,8 +42,9 @@ def chained(model, settings, camera, k=1):
     def backward(grad_image):
         grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
         grad_features = (grad_net.pop("x") / k**2).repeat(k, 0).repeat(k, 1).reshape(-1, 16)
+        tracked = settings.max_tracked if settings.blend == "softmax" else 0
         of_points = oracle_raster.gradients(
-            geometry, blend, point_features, grad_features, max_tracked=settings.max_tracked
+            geometry, blend, point_features, grad_features, max_tracked=tracked
         )
         return *of_points, grad_net
 
@@ -55,8 +56,7 @@ SETTINGS = {
     "soft, wide": {"radius": 1.4},
     "disc": {"footprint": "disc", "radius": 0.0015},
     "disc, the paper's gradients": {"footprint": "disc", "radius": 0.0015, "max_tracked": 3},
-    "sphere": {"footprint": "sphere", "radius": 0.11},
-    "sphere, Pulsar's gradients": {"footprint": "sphere", "radius": 0.11, "max_tracked": 5},
+    "disc, wide": {"footprint": "disc", "radius": 0.11, "max_tracked": 5},
 }
 
 
@@ -93,13 +93,12 @@ def test_all_samples_of_a_pixel_share_its_fragments(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
     fragments = {}
     for side in (1, 2):
-        renderer = Renderer(dev, model, RasterConfig(radius=0.85), supersampling=side)
+        settings = RasterConfig(radius=0.85, early_stop=0.2)
+        renderer = Renderer(dev, model, settings, supersampling=side)
         result = renderer.forward(camera, GAMMA, training=True)
-        fragments[side] = result.fragments()
-        assert fragments[side].sum() == result.pairs.total
+        fragments[side], shown = result.fragments()
+        assert (shown <= fragments[side]).all() and 0 < shown.sum() < fragments[side].sum()
     assert (fragments[2] >= fragments[1]).all() and fragments[2].sum() < 2.2 * fragments[1].sum()
-    rest = result.weights.sample_transmittance.get().mean(1)
-    np.testing.assert_allclose(result.transmittance.get(), rest, atol=1e-6)
 
 
 def test_padding_does_not_move_the_image(dev, rng):
@@ -166,7 +165,7 @@ def test_the_early_stop_of_a_call_is_that_of_other_settings(dev, rng, blend):
 def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, blend):
     settings = RasterConfig(blend=blend, radius=0.85)
     renderer = Renderer(dev, make_model(dev, rng, 300), settings)
-    near, far = (ring_cameras(1, size)[0] for size in (96, 48))
+    near, far = (ring_cameras(1, size)[0] for size in (192, 48))
     first = renderer.forward(far, GAMMA, until="weights").pairs.capacity
     dev.reset_peak()
     second = renderer.forward(near, GAMMA, until="weights").pairs.capacity

@@ -25,40 +25,38 @@ FLIPS = [
     ("training/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
     ("training/target_between", "a * b / 4", "a - b / 4", "scene: target between pixels"),
     ("raster/project.h", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
-    ("raster/footprint/disc.h", "1.0f), f->t", "1.0f), f->z", "raster: pairs, disc"),
-    ("raster/footprint/soft.h", "1.0f - sqrt(dis", "1.0f + sqrt(dis", "raster: pairs, soft"),
-    ("raster/footprint/sphere.h", "along - half", "along + half", "raster: pairs, sphere"),
+    ("raster/footprint/round.h", "across2 < reach2", "across2 > reach2", "raster: pairs, disc"),
+    ("raster/footprint/round.h", "1.0f - at.rest", "1.0f + at.rest", "raster: pairs, soft"),
+    ("raster/footprint/soft.h", "at->z - at->y", "at->z + at->y", "alpha: offsets of points"),
     ("raster/footprint/gaussian.h", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
     ("raster/project", "seen += basis[k]", "seen -= basis[k]", "raster: opacities by direction"),
-    ("raster/pairs", "as_uint(depth[k]", "as_uint(-depth[k]", "raster: pairs, soft"),
-    ("raster/footprint.h", "as_uint(falloff", "as_uint(-falloff", "raster: pairs, soft"),
-    ("raster/lists_by_bucket", "keys[a] < k", "keys[a] > k", "raster: thousands of equal depths"),
+    ("raster/pairs", "as_uint(DEPTH", "as_uint(-DEPTH", "raster: pairs, soft"),
+    ("raster/pairs", "sum = add_sat(sum, own)", "sum = sub_sat(sum, own)", "raster: pairs, soft"),
+    ("raster/pairs", "shift < bits", "shift > bits", "raster: thousands of equal depths"),
     ("raster/lists_by_key", "[middle] < k", "[middle] > k", "raster: thousands of equal depths"),
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
-    ("raster/depth", "depth += b", "depth -= b", "raster: depth, softmax"),
-    ("raster/depth", "before + share", "before - share", "raster: depth, alpha"),
-    ("raster/depth", "+ voxel_size)", "- voxel_size)", "raster: depth of samples"),
-    ("raster/offsets/soft.h", "along * m->y", "along + m->y", "alpha: offsets of points"),
-    ("raster/samples.h", "1.0f - sqrt(", "1.0f + sqrt(", "alpha: samples of a pixel"),
-    ("raster/clear_pairs", "= 0.0f", "= 1.0f", "raster: highest weights, alpha"),
+    ("raster/depth", "depth[own] += b", "depth[own] -= b", "raster: depth, softmax"),
+    ("raster/depth", "+ share * (z", "- share * (z", "raster: depth, alpha"),
+    ("raster/depth", "nearest + voxel", "nearest - voxel", "raster: depth of samples"),
     ("raster/highest_weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
-    ("raster/softmax", "(floats)(-M)), 0.0f", "(floats)(M)), 0.0f", "softmax: forward, disc"),
-    ("raster/softmax", "1.0f + o_z *", "1.0f - o_z *", "softmax: backward, soft"),
-    ("raster/samples.h", "= 1.0f - alpha", "= 1.0f + alpha", "alpha: forward, soft"),
-    ("raster/alpha", "b / T * dL_db", "T / b * dL_db", "alpha: backward, soft"),
-    ("raster/alpha", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
-    ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
-    ("raster/blend", "feature) - pixel_blend", "feature) + pixel_blend", "softmax: backward, soft"),
-    ("raster/alpha", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
-    ("raster/alpha", "own + g - B", "own + g + B", "alpha: samples of a pixel"),
-    ("raster/alpha", "SUM_LANES(T) / S", "SUM_LANES(T) * S", "alpha: samples of a pixel"),
-    ("raster/alpha", "(front - behind", "(front + behind", "alpha: samples of a pixel"),
-    ("raster/alpha", "(front - behind", "(front + behind", "alpha: distortion loss"),
+    ("raster/compositing.h", "-M), 0.0f", "+M), 0.0f", "softmax: forward, disc"),
+    ("raster/compositing.h", "= 1.0f - alpha", "= 1.0f + alpha", "alpha: forward, soft"),
+    ("raster/weights", "(k)] / SAMPLES;\n", "(k)] * SAMPLES;\n", "alpha: samples of a pixel"),
+    ("raster/weights", "nearest + range[", "nearest - range[", "alpha: forward, soft"),
+    ("raster/softmax", "D[own] *= exp", "D[own] /= exp", "softmax: forward, soft"),
+    ("raster/softmax", "[own]) <= tracked", "[own]) >= tracked", "softmax: backward, soft"),
+    ("raster/blend", " + transmittance[q]", " - transmittance[q]", "softmax: forward, soft"),
+    ("raster/blend", "(1.0f + a) * dL_db", "(1.0f - a) * dL_db", "softmax: backward, soft"),
+    ("raster/blend", "OF_POINT(own) - behind", "OF_POINT(own) + behind", "alpha: backward, disc"),
+    ("raster/blend", "after * inverse(", "after / inverse(", "alpha: backward, soft"),
+    ("raster/blend", "one = g.of_alpha", "one = -g.of_alpha", "alpha: gradient of alpha"),
+    ("raster/blend", "before - after", "before + after", "alpha: samples of a pixel"),
+    ("raster/blend", "before - after", "before + after", "alpha: distortion loss"),
+    ("raster/blend", "loss += b * dist", "loss -= b * dist", "alpha: distortion loss"),
+    ("raster/blend", "(range - g.mean[part])", "(range + g.mean[part])", "alpha: depth loss"),
+    ("raster/gather", "dL_df += load", "dL_df -= load", "alpha: backward, soft"),
+    ("raster/fragments", "= weight[", "= -weight[", "alpha: forward, soft"),
     ("training/depth_loss", "here - after", "here + after", "alpha: depth loss"),
-    ("raster/alpha", "- bend.y)", "+ bend.y)", "alpha: depth loss"),
-    ("raster/offsets", "opacity[i] * dL_ds", "-opacity[i] * dL_ds", "alpha: offsets of points"),
-    ("bench/project_spheres", "j] = positions[3 * i]", "j] = -positions[3 * i]", "raster: project"),
-    ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "bias, relu", "bias, !relu", "conv: direct, hard inputs"),
     ("layers/direct.h", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
@@ -79,11 +77,9 @@ FLIPS = [
     ("training/loss", "e + derivative_0", "e - derivative_0", "loss: L1 and SSIM"),
     ("training/loss", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
     ("training/ignored", "= -1.0f;", "= +1.0f;", "loss: ignored pixels"),
-    ("raster/softmax_gradient", "= dot16(", "= -dot16(", "softmax: backward, soft"),
     ("training/exposure", "b[c][c] += prior", "b[c][c] -= prior", "loss: exposure"),
     ("training/exposure_undo", "(r, gb) + white", "(r, gb) - white", "loss: exposure"),
     ("training/exposure", "m[i] -= a[k][i]", "m[i] += a[k][i]", "loss: colours of a view"),
-    ("raster/alpha", "SUM_LANES(b * dist", "-SUM_LANES(b * dist", "alpha: distortion loss"),
     ("training/adam", "(g - m_new)", "(g + m_new)", "adam: arrays"),
     ("training/adam", "- rate * m_new", "+ rate * m_new", "adam: gradients of 0, 1e-20 and 1e10"),
     ("training/ema", "a + weight", "a - weight", "training: moving average"),
@@ -100,16 +96,15 @@ FLIPS = [
 ]  # fmt: skip
 # here the replacement is a naive formula, which a hard case must detect
 NAIVE = [
-    ("raster/offsets/soft.h", "fmax(rest, LEAST_RHO)", "rest",
-     "alpha: a point on the ray"),
-    ("raster/footprint/sphere.h", "fmax(radius - w, 0.0f)", "(radius - w)",
-     "raster: pairs, sphere"),
+    ("raster/footprint/soft.h", "select(u, most, u > most)", "u", "alpha: a point on the ray"),
+    ("raster/compositing.h", "select(through, (floats)(LEAST_THROUGH), through < LEAST_THROUGH)",
+     "through", "alpha: an opaque fragment"),
     ("raster/footprint/gaussian.h", "sqrt(wide + v * (xx + yy) + v * v)",
      "sqrt((xx + v) * (yy + v) - xy * xy)", "alpha: needles"),
-    ("raster/softmax", "exp(fmin(fma(o_z, (floats)(sharpness), (floats)(-M)), 0.0f))",
-     "exp(o_z * sharpness)", "softmax: gamma of 1e-5"),
-    ("raster/depth", "select(missing, depth / alpha, is_there)", "depth / alpha",
-     "raster: depth of nothing"),
+    ("raster/compositing.h", "exp(fmin(fma((floats)(o_z), (floats)(sharpness), -M), 0.0f))",
+     "exp((floats)(o_z * sharpness))", "softmax: gamma of 1e-5"),
+    ("raster/depth", "select(missing, depth[own] / alpha[own], is_there)",
+     "depth[own] / alpha[own]", "raster: depth of nothing"),
     ("layers/gate", "expm1(negative_part(x))", "exp(negative_part(x)) - 1.0f",
      "layers: gate, features of 1e-12"),
     ("layers/gate", "(open * closed)", "(open * (1.0f - open))", "layers: gate, gates of 60"),
@@ -145,12 +140,12 @@ def test_a_fault_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped,
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
-    if path_of(file) == KERNELS / file:  # a header, included by its folder's kernels and by bench/
+    if path_of(file) == KERNELS / file:  # a header, included by its folder's kernels
         folder = shutil.copytree(KERNELS, tmp_path / "cl")
         (folder / file).write_text((folder / file).read_text().replace(text, flipped))
         monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
-        wings = file.split("/")[0], "bench"
-        others = {k: v for k, v in dev._programs.items() if k[0].split("/")[0] not in wings}
+        wing = file.split("/")[0]
+        others = {k: v for k, v in dev._programs.items() if k[0].split("/")[0] != wing}
     else:
         monkeypatch.setattr(device_module, "Program", flipping(file, text, flipped))
         others = {key: program for key, program in dev._programs.items() if key[0] != file}
@@ -162,7 +157,9 @@ def acts_as_cpu(dev, file, text):
     """dev.is_cpu, except for a kernel that only CPUs or only GPUs run."""
     if file == "raster/lists_by_key":
         return False
-    return dev.is_cpu or file == "raster/lists_by_bucket" or file.startswith("layers/winograd")
+    return (
+        dev.is_cpu or file in ("raster/pairs", "raster/blend") or file.startswith("layers/winograd")
+    )
 
 
 def flipping(file, text, flipped):

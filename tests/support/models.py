@@ -8,8 +8,8 @@ from scipy.sparse import csr_array
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.fragments import list_fragments
 from pp_cl.engine.raster.points import PointCloud
-from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
@@ -54,11 +54,8 @@ def drawn_alone(monkeypatch, renderer):
 
 def blend_matrix(observation):
     """(HW, N) sparse: the blend weight of each point in each pixel of an Observation."""
-    pairs = observation.view.pairs
-    is_listed, point, weight = listed_fragments(pairs, observation.view.weights)
-    offset = np.concatenate([[0], np.cumsum(is_listed)])[pairs.pixel_offset.get()]
-    shape = pairs.pixels, pairs.points
-    matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
-    return matrix[
-        observation.view.cropped(np.arange(pairs.pixels).reshape(observation.view.size)).ravel()
-    ]
+    view = observation.view
+    listed = list_fragments(view.dev, view.points, view.pairs, view.weights)
+    shape = view.pairs.pixels, len(view.points.point_count)
+    matrix = csr_array((listed.weight, listed.point.astype(np.int32), listed.offset), shape=shape)
+    return matrix[view.cropped(np.arange(shape[0]).reshape(view.size)).ravel()]

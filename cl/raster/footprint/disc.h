@@ -1,10 +1,5 @@
 // The hard disc of the paper: d = 1 everywhere.
 #include "raster/footprint/round.h"
 
+#define MOVES 0  // without offsets
 #define surface_range(range, radius, d) (range)
-
-ALWAYS_INLINE Coverage
-footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
-    floats distance2;
-    return (Coverage){disc_covers(f, rim, px, py, &distance2), (floats)(1.0f), f->t};
-}

@@ -82,13 +82,6 @@ def tiles_find(
     return _flags(dev, "tiles_find", (h, w), convert, c=c, background=background, x=x)
 
 
-def tiles_covered(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Pending[np.ndarray]:
-    """(rows, columns) bool: the tiles of an image of size (height, width) with a pixel that has
-    fragments, by its Pairs.pixel_offset (HW+1,) uint32.
-    """
-    return _flags(dev, "tiles_covered", size, pixel_offset=pixel_offset)
-
-
 def tiles_with(pixels: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: the tiles in which any of the pixels (H, W) bool is set."""
     (height, width), (rows, columns) = pixels.shape, grid_shape(*pixels.shape)

@@ -1,5 +1,5 @@
 """Computes features of the visible points from their spherical harmonics, and blends them into the
-pixels by the fragments' weights; gathers the gradients of the blend by visible point.
+pixels by the fragments' weights; sums the gradients of the blend by tile, then by visible point.
 """
 
 from __future__ import annotations
@@ -12,16 +12,12 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes, launch_groups, replayed, row_parts
-from pp_cl.engine.raster.footprint import FOOTPRINTS, footprint_macros, sample_macros
-from pp_cl.engine.raster.pairs import Pairs
+from pp_cl.engine.device.launch import lanes, replayed, row_parts
+from pp_cl.engine.raster.footprint import FOOTPRINTS
+from pp_cl.engine.raster.pairs import Pairs, launch_tiles
 from pp_cl.engine.raster.points import four_blocks, stored_degree
 from pp_cl.engine.raster.project import ProjectedPoints
-from pp_cl.engine.raster.softmax import softmax_gradient
-from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
-
-ON_GPU = 4  # lanes on GPUs: each work-item reads vectors
-SPAN = 64  # pixels that share a sum of the distortion loss
+from pp_cl.engine.raster.weights import BlendWeights
 
 
 def shade_forward(
@@ -39,14 +35,14 @@ def shade_forward(
     points, S = count of them. sh: PointCloud.sh.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
-    macros = footprint_macros(points.footprint)
-    dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh), **macros).launch(
+    macros = {"DEGREE": stored_degree(sh), **points.macros()}
+    dev.program("raster/shade", LANES=lanes(dev), **macros).launch(
         "shade_forward",
         count * row_parts(dev),
         s=count,
         visible=visible,
         camera=points.camera_buffer,
-        point_camera=points.point_camera,
+        point_record=points.point_record,
         sh_0=sh_0,
         sh_1=sh_1,
         sh_2a=sh_2a,
@@ -59,6 +55,7 @@ def shade_forward(
 def blend_forward(
     dev: Device,
     b: Buffers,
+    points: ProjectedPoints,
     pairs: Pairs,
     weights: BlendWeights,
     visible_features: Array,
@@ -67,35 +64,38 @@ def blend_forward(
     """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32. b: keeps
     the recorded call, see replayed().
     """
-    dev.program("raster/blend", LANES=lanes(dev, ON_GPU)).launch(
+    launch_tiles(
+        dev,
+        "raster/blend",
         "blend_forward",
-        pairs.pixels * row_parts(dev, ON_GPU),
+        points,
+        pairs,
         hw=pairs.pixels,
-        pixel_offset=pairs.pixel_offset,
-        pixel_weight_point=weights.pixel_weight_point,
         point_slot=weights.point_slot,
         visible_features=visible_features,
+        transmittance=weights.transmittance,
         features=features,
+        **weights.walk(),
     )
 
 
 def blend_backward_table(
-    visible: int, pixels: int, pairs: int, blend: str, footprint: str = "soft", side: int = 1
+    visible: int, pairs: int, tiles: int, blend: str, footprint: str = "soft"
 ) -> Table:
-    """The buffers of the backward pass for a number of pixels with side x side samples each, and
-    for capacities of visible points and of pairs. blend: one of BLENDS.
+    """The buffers of the backward pass for capacities of visible points and of pairs, and a number
+    of tiles. blend: one of BLENDS.
     """
     table: Table = {
-        "pair_gradient": ((pairs, 1 + side**2), np.float32),
+        "pair_features": ((pairs, 16), np.float32),
+        "pair_sums": ((pairs, 8), np.float32),
+        "pair_shows": ((pairs,), np.uint8),
         "grad_visible_features": ((visible, 16), np.float32),
         "grad_opacity": ((visible,), np.float32),
+        "distortion": ((tiles,), np.float32),
     }
     if blend == "softmax":
-        return table | {"pixel_blend": ((pixels,), np.float32)}
-    return table | {
-        "distortion": ((-(-pixels // SPAN),), np.float32),
-        "grad_offset": ((visible, FOOTPRINTS[footprint].offsets), np.float32),
-    }
+        return table
+    return table | {"grad_offset": ((visible, FOOTPRINTS[footprint].offsets), np.float32)}
 
 
 @dataclass(frozen=True)
@@ -105,16 +105,13 @@ class BlendGradients:
 
     visible_features: (S, 16). opacity: (S,). offset: (S, 4) for soft points composited by alpha,
     (S, 16) for Gaussians, through the falloff of their fragments; None if not asked for.
-    distortion: (ceil(HW/SPAN),), the distortion loss by SPAN pixels; None if its weight is 0.
-    pair_gradient: (P, 1 + samples), for each pair of a visible point the blend weight b and what
-    each sample of the fragment adds to dL/dopacity; 0 where it is dropped or not tracked.
+    distortion: (TILES,), the distortion loss by tile; None if its weight is 0.
     """
 
     visible_features: Array
     opacity: Array
     offset: Array | None
     distortion: Array | None
-    pair_gradient: Array
 
 
 def blend_backward(
@@ -133,7 +130,8 @@ def blend_backward(
     voxel_size: float = 0.0,
     max_weight: Array | None = None,
 ) -> BlendGradients:
-    """The gradients of the points weights.visible, after blend_weights() with derivatives.
+    """The gradients of the points weights.visible, after blend_weights() with derivatives, for
+    pairs numbered by point.
 
     visible_features, features: from blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times sum_ij
@@ -153,84 +151,58 @@ def blend_backward(
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
-    count = weights.total
-    rows = len(visible_features), pairs.pixels, pairs.capacity
-    kind = points.footprint, points.side
-    b.require(blend_backward_table(*rows, weights.blend, *kind))
-    clear_pairs(dev, pairs, weights, b.pair_gradient)
-    of_fragments: dict[str, Any] = {
-        "hw": pairs.pixels,
-        "tracked": weights.tracked,
-        "pixel_offset": pairs.pixel_offset,
-        "pair_key": pairs.pair_key,
-        "pixel_weight_point": weights.pixel_weight_point,
-        "pixel_derivative": weights.pixel_derivative,
-        "grad_features": grad_features,
-        "pair_gradient": b.pair_gradient,
-    }
-    macros, of_samples = footprint_macros(*kind), sample_macros(dev, *kind)
-    if is_alpha:
-        launch_groups(
-            dev,
-            "raster/alpha",
-            "alpha_gradient",
-            -(-pairs.pixels // SPAN),
-            most=SPAN,
-            defines=of_samples | {"SPAN": SPAN},
-            has_grad_alpha=int(grad_alpha is not None),
-            distortion_weight=distortion_weight,
-            sample_transmittance=weights.sample_transmittance,
-            opacity=weights.opacity,
-            point_slot=weights.point_slot,
-            visible_features=visible_features,
-            grad_alpha=grad_alpha,
-            has_depth=int(has_depth),
-            depth_gradient=depth_gradient,
-            distortion=b.distortion,
-            **of_fragments,
-        )
-    else:
-        softmax_gradient(
-            dev, pairs.pixels, features=features, pixel_blend=b.pixel_blend, **of_fragments
-        )
-    of_points: dict[str, Any] = {
-        "s": count,
-        "visible": weights.visible_rows,
+    capacities = len(visible_features), pairs.capacity, len(weights.tile_shown)
+    b.require(blend_backward_table(*capacities, weights.blend, points.footprint))
+    dev.fill(b.pair_shows, 0)
+    of_pairs: dict[str, Any] = {
         "point_offset": pairs.point_offset,
-        "pair_pixel": pairs.pair_pixel,
-        "pair_gradient": b.pair_gradient,
+        "visible_features": visible_features,
+        "pair_features": b.pair_features,
+        "pair_sums": b.pair_sums,
+        "pair_shows": b.pair_shows,
     }
-    dev.program("raster/blend", DL_DB=int(not is_alpha), LANES=lanes(dev, ON_GPU), **macros).launch(
+    launch_tiles(
+        dev,
+        "raster/blend",
         "blend_backward",
-        count * row_parts(dev, ON_GPU),
-        is_recorded=max_weight is not None,
-        pixel_blend=None if is_alpha else b.pixel_blend,
-        visible_features=visible_features,
+        points,
+        pairs,
+        defines={"SOFTMAX": int(not is_alpha), "MOVED": int(moves)},
+        hw=pairs.pixels,
+        limit=weights.limit,
+        pair_key=pairs.pair_key,
+        distortion_weight=distortion_weight,
+        tile_shown=weights.tile_shown,
+        point_slot=weights.point_slot,
+        sample_state=weights.sample_state,
+        sample_end=weights.sample_end if is_alpha else weights.sample_tracked,
+        features=None if is_alpha else features,
         grad_features=grad_features,
+        grad_alpha=grad_alpha,
+        depth_gradient=depth_gradient,
+        distortion=b.distortion,
+        **of_pairs,
+    )
+    dev.program("raster/gather", LANES=lanes(dev), MOVED=int(moves), **points.macros()).launch(
+        "gather_pairs",
+        weights.total * row_parts(dev),
+        s=weights.total,
+        is_recorded=max_weight is not None,
+        voxel_size=voxel_size,
+        radius=points.radius,
+        visible=weights.visible_rows,
+        camera=points.camera_buffer,
+        point_record=points.point_record,
+        cloud_offset=points.cloud_offset,
         grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
+        grad_offset=b.grad_offset if moves else None,
         max_weight=max_weight,
-        **of_points,
+        **of_pairs,
     )
-    if moves:
-        dev.program("raster/offsets", **of_samples).launch(
-            "offset_gradient",
-            count,
-            voxel_size=voxel_size,
-            radius=points.radius,
-            camera=points.camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            cloud_offset=points.cloud_offset,
-            opacity=weights.opacity,
-            pair_point_falloff=pairs.pair_point_falloff,
-            grad_offset=b.grad_offset,
-            **of_points,
-        )
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,
         b.grad_offset if moves else None,
         b.distortion if distortion_weight > 0 else None,
-        b.pair_gradient,
     )

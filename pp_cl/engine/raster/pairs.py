@@ -1,5 +1,5 @@
-"""Finds the fragments of a view, the pairs of a point and a pixel that it covers. Lists them by
-point for the backward pass, and by pixel, sorted by depth, for blending.
+"""Finds the pairs of a point and a tile of the image that it may cover, and lists them by tile,
+sorted by depth: the order in which every pixel of the tile sees its points.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import Buffers, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, launch_groups, replayed
-from pp_cl.engine.device.scan import BLOCK, blocks_of, exclusive_scan, read_total
-from pp_cl.engine.raster.footprint import footprint_macros
-from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.device.scan import BLOCK, exclusive_scan, read_total
+from pp_cl.engine.raster.project import ProjectedPoints, tiles_of
 from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
-BUCKETS = 256  # most buckets of pairs; CPUs sort them in parallel
-MOST_CHUNKS = 64  # most chunks of pairs; CPUs put them into buckets in parallel
+MOST_CHUNKS = 64  # most chunks of the points; CPUs list them in parallel
 RUN = 64  # keys that GPUs rank by comparing all with all; runs of this length are merged
 LONG_LIST = RUN * RUN  # GPUs merge lists of more keys than this in several passes
+TILE_SAMPLES = 256  # GPUs walk along a tile with a work-item for each of its pixels
 
 
 @dataclass
 class Pairs:
-    """The fragments of a view of N points and HW pixels, valid until the next ones are found.
+    """The pairs of a view of N points, valid until the next ones are found. Tiles are numbered row
+    by row.
 
-    The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
-    other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
+    The arrays have a capacity of P pairs. If the view has more, they must not be read: find the
+    pairs again with more capacity (capacity_needed()).
 
-    count: the number of pairs, downloaded by read_count(). point_offset: (N+1,) uint32, point i
-    owns pairs point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1,) uint32, pixel q owns keys
-    pixel_offset[q] to pixel_offset[q+1]. pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P,
-    2) uint32, the point, and the bits of the falloff d of Eq. (1); if a pixel has several samples,
-    (P, 1), only the point. pair_key: (P,) uint64, depth bits << 32 | pair, sorted within each pixel
-    by depth, then by point.
+    size: (height, width) of the image. tiles: (rows, columns). tile_offset: (TILES+1,) uint32, tile
+    t owns keys tile_offset[t] to tile_offset[t+1]. pair_key: (P,) uint64, depth bits << 32 | point,
+    sorted within each tile. point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to
+    point_offset[i+1], a tile each, row by row; None if not asked for. shown: (P,) uint64, scratch
+    memory that blend_weights() fills. count: the number of pairs, downloaded by read_count().
     """
 
-    point_offset: Array
-    pixel_offset: Array
-    pair_pixel: Array
-    pair_point_falloff: Array
+    size: tuple[int, int]
+    tiles: tuple[int, int]
+    tile_offset: Array
     pair_key: Array
+    point_offset: Array | None
+    shown: Array
     count: Any = None
 
     def read_count(self, dev: Device) -> None:
         """Enqueue the download of the number of pairs."""
-        self.count = read_total(dev, self.point_offset)
+        self.count = read_total(dev, self.tile_offset)
 
     @property
     def total(self) -> int:
@@ -59,30 +59,39 @@ class Pairs:
     @property
     def capacity(self) -> int:
         """P."""
-        return len(self.pair_pixel)
-
-    @property
-    def points(self) -> int:
-        """N."""
-        return self.point_offset.size - 1
+        return len(self.pair_key)
 
     @property
     def pixels(self) -> int:
         """HW."""
-        return self.pixel_offset.size - 1
+        return self.size[0] * self.size[1]
 
 
-def pairs_table(n: int, pixels: int, pairs: int, side: int = 1) -> Table:
-    """The buffers for n points, a number of pixels and a capacity of pairs. side: see Pairs."""
-    return {
-        "point_offset": ((n + 1,), np.uint32),
-        "pixel_offset": ((pixels + 1,), np.uint32),
-        "pair_pixel": ((pairs,), np.uint32),
-        "pair_point_falloff": ((pairs, 2 if side == 1 else 1), np.uint32),
+def pairs_table(
+    dev: Device, n: int, size: tuple[int, int], pairs: int, side: int = 1, by_point: bool = False
+) -> Table:
+    """The buffers for n points, an image of size (height, width) and a capacity of pairs. side: see
+    ProjectedPoints. by_point: with point_offset.
+    """
+    rows, columns = tiles_of(size, side)
+    tiles = rows * columns
+    table: Table = {
+        "tile_next": ((_chunks(dev) if dev.is_cpu else 1, tiles), np.uint32),
+        "tile_size": ((tiles,), np.uint32),
+        "tile_offset": ((tiles + 1,), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # used to sort the keys, then for pixel_weight_point of weights.py
-        "pair_scratch": ((pairs,), np.uint64),
+        # used to sort the keys, then for the points that show
+        "shown": ((pairs,), np.uint64),
     }
+    if not dev.is_cpu:
+        table["pair_tile"] = (pairs,), np.uint32
+    if by_point:
+        table["point_offset"] = (n + 1,), np.uint32
+    return table
+
+
+def _chunks(dev):
+    return min(MOST_CHUNKS, 2 * dev.info["compute_units"])
 
 
 @replayed
@@ -93,92 +102,61 @@ def find_pairs(
     size: tuple[int, int],
     capacity: int = 1,
     times_seen: Array | None = None,
+    by_point: bool = False,
 ) -> Pairs:
-    """Find the fragments in an image of size (height, width), if there are at most `capacity`. Does
-    not wait for the device; read_count() downloads their number.
+    """Find the pairs in an image of size (height, width), if there are at most `capacity`. Does not
+    wait for the device; read_count() downloads their number.
 
-    times_seen: (N,) float32, counts for each point the images in which it has a fragment.
+    times_seen: (N,) float32, counts for each point the images in which its box lies. by_point: also
+    number the pairs by point.
     """
-    n, pixels, side = len(points.point_box), size[0] * size[1], points.side
-    b.require(pairs_table(n, pixels, capacity, side))
-    if not dev.is_cpu:
-        b.require({"pixel_count": ((pixels,), np.uint32)})
-        dev.fill(b.pixel_count, 0)
-    launch_groups(
-        dev,
-        "raster/pairs",
+    n, tiles = len(points.point_count), tiles_of(size, points.side)
+    b.require(pairs_table(dev, n, size, capacity, points.side, by_point))
+    macros = {"LANES": lanes(dev), "BLOCK": BLOCK, **points.macros()}
+    program = dev.program("raster/pairs", **macros)
+    chunks, count = (_chunks(dev) if dev.is_cpu else n), tiles[0] * tiles[1]
+    of_points: dict[str, Any] = {
+        "n": n,
+        "chunks": chunks,
+        "columns": tiles[1],
+        "tiles": count,
+        "point_record": points.point_record,
+        "point_count": points.point_count,
+        "block_sum": points.block_sum,
+        "tile_next": b.tile_next,
+    }
+    dev.fill(b.tile_next, 0)
+    program.launch("pairs_count", chunks, **of_points)
+    rows = {"rows": len(b.tile_next), "tiles": count}
+    program.launch("pairs_sum", count, tile_next=b.tile_next, tile_size=b.tile_size, **rows)
+    exclusive_scan(dev, b.tile_size, b.tile_offset)
+    program.launch(
         "pairs_fill",
-        blocks_of(n),
-        defines={"LANES": lanes(dev), "BLOCK": BLOCK, **footprint_macros(points.footprint, side)},
-        n=n,
+        chunks,
         p=capacity,
         is_counted=times_seen is not None,
-        camera=points.camera_buffer,
-        point_camera=points.point_camera,
-        point_shape=points.point_shape,
-        point_box=points.point_box,
-        point_count=points.point_count,
-        block_sum=points.block_sum,
-        point_offset=b.point_offset,
-        pair_pixel=b.pair_pixel,
-        pair_point_falloff=b.pair_point_falloff,
-        point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
-        times_seen=times_seen,
-        pixel_count=b.pixel_offset if dev.is_cpu else b.pixel_count,
-    )
-    if dev.is_cpu:
-        _list_by_bucket(dev, b, n, pixels, capacity)
-    else:
-        _list_by_key(dev, b, pixels, capacity)
-    return Pairs(
-        b.point_offset,
-        b.pixel_offset,
-        b.pair_pixel,
-        b.pair_point_falloff,
-        b.pair_key,
-    )
-
-
-def _list_by_bucket(dev, b, n, pixels, capacity):
-    """Sort pair_key, which is listed by point, and write pixel_offset."""
-    program = dev.program("raster/lists_by_bucket", BUCKETS=BUCKETS)
-    chunks = min(MOST_CHUNKS, dev.info["compute_units"])
-    stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # a bucket covers 2^stretch pixels
-    shared = {
-        "chunks": chunks,
-        "stretch": stretch,
-        "pair_pixel": b.pair_pixel,
-        "bucket_size": dev.scratch("buckets", BUCKETS * chunks, np.uint32),
-    }
-    filled = {"n": n, "p": capacity, "point_offset": b.point_offset, **shared}
-    program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
-    keys = {"point_key": b.pair_key, "bucket_key": b.pair_scratch}
-    program.launch("pairs_bucket", chunks, local=1, **keys, **filled)
-    program.launch(
-        "pairs_list",
-        ((pixels - 1) >> stretch) + 1,
-        local=1,
-        hw=pixels,
-        bucket_key=b.pair_scratch,
-        pixel_offset=b.pixel_offset,
+        tile_offset=b.tile_offset,
         pair_key=b.pair_key,
-        **shared,
+        pair_tile=b.tile_size if dev.is_cpu else b.pair_tile,
+        times_seen=times_seen,
+        **of_points,
     )
+    shared: dict[str, Any] = {"tiles": count, "p": capacity, "tile_offset": b.tile_offset}
+    if dev.is_cpu:
+        program.launch("pairs_sort", count, 1, pair_key=b.pair_key, other=b.shown, **shared)
+    else:
+        _sort_by_key(dev, b, capacity, shared)
+    if by_point:
+        exclusive_scan(dev, points.point_count, b.point_offset)
+    arrays = b.tile_offset, b.pair_key, b.point_offset if by_point else None, b.shown
+    return Pairs(size, tiles, *arrays)
 
 
-def _list_by_key(dev, b, pixels, capacity):
-    """Sort the keys of pair_scratch, listed by point, into pair_key, and write pixel_offset."""
+def _sort_by_key(dev, b, capacity, shared):
+    """Sort the keys of b.pair_key within each tile, on GPUs."""
     program = dev.program("raster/lists_by_key", RUN=RUN)
-    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
-    shared = {
-        "p": capacity,
-        "hw": pixels,
-        "pair_pixel": b.pair_pixel,
-        "pixel_offset": b.pixel_offset,
-    }
-    keys, other = b.pair_key, b.pair_scratch
-    program.launch("pairs_scatter", capacity, point_key=other, pair_key=keys, **shared)
-    program.launch("pairs_sort_runs", capacity, pair_key=keys, sorted=other, **shared)
+    shared = {"pair_tile": b.pair_tile, **shared}
+    keys, other = b.pair_key, b.shown
 
     def merge(source, target, width, group, least):
         sizes = {"width": width, "group": group, "least": least}
@@ -186,10 +164,37 @@ def _list_by_key(dev, b, pixels, capacity):
             "pairs_merge_runs", capacity, sorted=source, pair_key=target, **sizes, **shared
         )
 
+    program.launch("pairs_sort_runs", capacity, pair_key=keys, sorted=other, **shared)
     merge(other, keys, RUN, LONG_LIST, 0)
     if capacity > LONG_LIST:  # the long lists, to the other buffer and back
         merge(keys, other, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
         merge(other, keys, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
+
+
+def launch_tiles(
+    dev: Device, name: str, kernel: str, points: ProjectedPoints, pairs: Pairs, **arguments: Any
+) -> None:
+    """Launch a kernel of cl/<name>.cl that walks along the tiles' lists, as cl/raster/tiles.h
+    describes. arguments: by parameter name, apart from those that all of them have; defines: macros
+    of the program.
+    """
+    samples, (rows, columns) = points.side**2, pairs.tiles
+    defines = {"LANES": lanes(dev, samples), **points.macros(), **arguments.pop("defines", {})}
+    launch_groups(
+        dev,
+        name,
+        kernel,
+        rows * columns,
+        most=TILE_SAMPLES // samples,
+        defines=defines,
+        tiles=rows * columns,
+        columns=columns,
+        camera=points.camera_buffer,
+        point_record=points.point_record,
+        tile_offset=pairs.tile_offset,
+        shown=pairs.shown,
+        **arguments,
+    )
 
 
 def capacity_needed(pairs: Pairs) -> int:
@@ -199,7 +204,7 @@ def capacity_needed(pairs: Pairs) -> int:
     total = pairs.total
     if total >= MOST_PAIRS:
         raise UserError(
-            f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
+            f"the points of one view touch more than {MOST_PAIRS} tiles in all: "
             "lower --points, raise --downscale, or lower raster.radius"
         )
     return min(grown(pairs.capacity, total), MOST_PAIRS)

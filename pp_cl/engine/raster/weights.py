@@ -1,5 +1,5 @@
-"""Computes the blend weight of each fragment in its pixel, by alpha compositing or by the paper's
-softmax; lists the visible points.
+"""Walks along the tiles' lists, nearest points first, by alpha compositing or by the paper's
+softmax: finds the points that show and what each sample lets through; lists the visible points.
 """
 
 from __future__ import annotations
@@ -10,54 +10,66 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Table
+from pp_cl.engine.device.buffers import Buffers, Pending, Table, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import replayed
 from pp_cl.engine.device.scan import nonzero, read_total
-from pp_cl.engine.raster.footprint import sample_macros
-from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import ProjectedPoints
-from pp_cl.engine.raster.softmax import softmax_weights
+from pp_cl.engine.raster.pairs import TILE_SAMPLES, Pairs, launch_tiles
+from pp_cl.engine.raster.project import ProjectedPoints, tiles_of
 
 BLENDS = ("softmax", "alpha")
-NO_POINT = 0xFFFFFFFF  # ends a pixel's list in pixel_weight_point if fragments were dropped
-ALL = 2**32 - 1  # BlendWeights.tracked if all fragments get gradients
+ALL = 2**32 - 1  # max_tracked if all fragments get gradients
+# The least early_stop of alpha compositing: the way back divides by what a sample has let through.
+LEAST_STOP = 1e-20
+PART = 4  # pixels along a part of the image of which is known whether it shows anything
 
 
 @dataclass
 class BlendWeights:
-    """The blend weights of a Pairs object, valid until the next ones are computed.
+    """What blend_weights() has found, valid until the next call. A sample's values lie by tile, by
+    block of 16 samples and by sample, see cl/raster/tiles.h.
 
-    blend: one of BLENDS. opacity, early_stop: the arguments of blend_weights(). tracked: how many
-    nearest fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 |
-    point, each pixel's fragments by depth; where fragments are dropped, NO_POINT ends the pixel's
-    list. pixel_derivative: (P, samples) float32 in the same order, the factor s of the backward
-    pass, dL/dopacity = s * dL/db (cl/raster/blend.cl); None without derivatives.
+    blend: one of BLENDS. limit: early_stop of alpha compositing, 1 / gamma of the softmax.
+    tile_shown: (TILES,) uint32, the number of points of each tile in Pairs.shown, which holds
+    blocks << 32 | point.
+    transmittance: (HW,) float32, the background's weight. mean_range: (HW,) float32, the mean
+    distance from the eye of what a pixel shows, by weight, 0 where it shows nothing; not of the
+    softmax. is_covered: (H/4, W/4) int32, whether a part of 4 x 4 pixels shows anything.
+    sample_state: (2, BLOCKS, 16) float32, of alpha compositing, with derivatives: the transmittance
+    behind all and the sum of weights times distances; of the softmax M and 1/D. sample_end: int32
+    (BLOCKS, 16), how many of the tile's points are before a sample's early stop; sample_tracked:
+    those that get gradients. pair_weight: (P,) float32, the sum of each pair's weights; None if not
+    asked for.
 
     point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, the index of a
-    visible point in `visible`, undefined for others. transmittance: (HW,) float32 behind all
-    fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, None
-    without derivatives, too. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32,
-    the number of visible points; count: that number, downloaded by read_count().
+    visible point in `visible`, undefined for others. visible_rows: (N,) uint32, begins with
+    `visible`; found: (1,) uint32, the number of visible points; count: that number, downloaded by
+    read_count().
     """
 
     blend: str
-    opacity: Array
-    early_stop: float
-    tracked: int
-    pixel_weight_point: Array
-    pixel_derivative: Array | None
+    limit: float
+    tile_shown: Array
+    transmittance: Array
+    mean_range: Array
+    is_covered: Array
+    sample_state: Array | None
+    sample_end: Array | None
+    sample_tracked: Array | None
+    pair_weight: Array | None
     point_is_visible: Array
     point_slot: Array
-    transmittance: Array | None
     visible_rows: Array
     found: Array
-    sample_transmittance: Array | None = None
     count: Any = None
 
     def read_count(self, dev: Device) -> None:
         """Enqueue the download of the number of visible points."""
         self.count = read_total(dev, self.found)
+
+    def read_covered(self, dev: Device) -> Pending[np.ndarray]:
+        """(H/4, W/4) bool: the parts of 4 x 4 pixels that show anything."""
+        return read_later(dev, self.is_covered, convert=lambda flags: flags != 0)
 
     @property
     def total(self) -> int:
@@ -66,26 +78,49 @@ class BlendWeights:
 
     @property
     def visible(self) -> Array:
-        """(S,) uint32, ascending: the visible points, which have a fragment that is not dropped.
-        Only they are shaded and get gradients. Waits until their number is known.
+        """(S,) uint32, ascending: the visible points, which show in a sample. Only they are shaded
+        and get gradients. Waits until their number is known.
         """
         return self.visible_rows[: self.total]
 
+    def walk(self) -> dict[str, Any]:
+        """The arguments, by name, with which a kernel walks along the points that show again, and
+        the program's macros.
+        """
+        is_softmax = self.blend == "softmax"
+        return {
+            "limit": self.limit,
+            "tile_shown": self.tile_shown,
+            "sample_state": self.sample_state if is_softmax else None,
+            "sample_end": self.sample_end if is_softmax else None,
+            "defines": {"SOFTMAX": int(is_softmax)},
+        }
 
-def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table:
-    """The buffers for n points, a number of pixels with side x side samples each, and a number of
-    derivatives, 0 for none; pixel_weight_point uses pair_scratch of pairs_table().
+
+def weights_table(
+    n: int, size: tuple[int, int], blend: str, side: int = 1, *, derivatives: bool, pairs: int = 0
+) -> Table:
+    """The buffers for n points and an image of size (height, width) with side x side samples a
+    pixel. pairs: the capacity of pairs if their weights are recorded, else 0.
     """
+    (rows, columns), pixels = tiles_of(size, side), size[0] * size[1]
+    samples = rows * columns * TILE_SAMPLES // 16, 16
     table: Table = {
+        "tile_shown": ((rows * columns,), np.uint32),
         "transmittance": ((pixels,), np.float32),
+        "mean_range": ((pixels,), np.float32),
+        "is_covered": ((-(-size[0] // PART), -(-size[1] // PART)), np.int32),
         "point_is_visible": ((n,), np.uint8),
         "visible": ((n,), np.uint32),
         "point_slot": ((n,), np.uint32),
         "visible_count": ((1,), np.uint32),
     }
-    if derivatives:
-        table["sample_transmittance"] = (pixels, side**2), np.float32
-        table["pixel_derivative"] = (derivatives, side**2), np.float32
+    if derivatives or blend == "softmax":
+        table |= {"sample_state": ((2, *samples), np.float32), "sample_end": (samples, np.int32)}
+    if blend == "softmax":
+        table["sample_tracked"] = samples, np.int32
+    if pairs:
+        table["pair_weight"] = (pairs,), np.float32
     return table
 
 
@@ -95,97 +130,72 @@ def blend_weights(
     b: Buffers,
     points: ProjectedPoints,
     pairs: Pairs,
-    opacity: Array,
     *,
     blend: str,
     gamma: float,
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
+    records: bool = False,
 ) -> BlendWeights:
-    """The weights of all pairs of these points, in the buffers b of find_pairs().
+    """The weights of these pairs' fragments, in the buffers b of find_pairs(), whose `shown` is
+    written.
 
-    opacity: (N,) float32 in [0, 1]. blend: one of BLENDS; a pixel with several samples needs
-    "alpha", and discs. gamma: depth sharpness of the softmax. max_tracked: only this many nearest
-    fragments of a pixel get gradients (64 in the paper); 0: all. early_stop: in [0, 1): a pixel
-    drops all fragments behind the depth where no fragment can have this share any more (0.001 in
-    the paper); 0: none. derivatives: write what the backward pass reads. read_count() downloads the
-    number of visible points.
+    blend: one of BLENDS; a pixel with several samples needs "alpha", and discs. gamma: depth
+    sharpness of the softmax. max_tracked: of the softmax, only this many nearest fragments of a
+    pixel get gradients (64 in the paper); 0: all. early_stop: in [0, 1): a sample drops all
+    fragments behind the depth where no fragment can have this share any more (0.001 in the paper);
+    0: none, of alpha compositing LEAST_STOP. derivatives: write what the backward pass reads.
+    records: write pair_weight, for pairs numbered by point. read_count() downloads the number of
+    visible points.
     """
-    side, capacity = points.side, pairs.capacity if derivatives else 0
-    b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
+    n, is_alpha = len(points.point_count), blend == "alpha"
+    recorded = pairs.capacity if records else 0
+    b.require(
+        weights_table(n, pairs.size, blend, points.side, derivatives=derivatives, pairs=recorded)
+    )
     dev.fill(b.point_is_visible, 0)
-    derivative = b.pixel_derivative if derivatives else None
-    sample_transmittance = b.sample_transmittance if derivatives else None
+    if records:
+        dev.fill(b.pair_weight, 0)
+    keeps = derivatives or not is_alpha
+    state, end = (b.sample_state, b.sample_end) if keeps else (None, None)
     shared: dict[str, Any] = {
-        "hw": pairs.pixels,
-        "early_stop": early_stop,
-        "camera": points.camera_buffer,
-        "pixel_offset": pairs.pixel_offset,
+        "p": pairs.capacity,
         "pair_key": pairs.pair_key,
-        "pair_point_falloff": pairs.pair_point_falloff,
-        "opacity": opacity,
-        "pixel_weight_point": b.pair_scratch,
-        "pixel_derivative": derivative,
+        "early_stop": max(early_stop, LEAST_STOP) if is_alpha else early_stop,
+        "tile_shown": b.tile_shown,
         "point_is_visible": b.point_is_visible,
+        "transmittance": b.transmittance,
+        "is_covered": b.is_covered,
+        "point_offset": pairs.point_offset if records else None,
+        "pair_weight": b.pair_weight if records else None,
+        "sample_state": state,
+        "sample_end": end,
     }
-    if blend == "alpha":
-        macros = sample_macros(dev, points.footprint, side)
-        dev.program("raster/alpha", DERIVATIVES=int(derivatives), **macros).launch(
-            "alpha_weights",
-            pairs.pixels,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            transmittance=b.transmittance,
-            sample_transmittance=sample_transmittance,
-            **shared,
-        )
+    macros, view = {"RECORDS": int(records)}, (points, pairs)
+    if is_alpha:
+        macros["DERIVATIVES"] = int(derivatives)
+        shared |= {"defines": macros, "mean_range": b.mean_range}
+        launch_tiles(dev, "raster/weights", "alpha_weights", *view, hw=pairs.pixels, **shared)
     else:
-        softmax_weights(dev, pairs.pixels, gamma, derivatives, **shared)
+        macros["DROPS"] = int(early_stop > 0)
+        shared |= {"defines": macros, "sample_tracked": b.sample_tracked}
+        shared |= {"sharpness": 1 / gamma, "tracked": max_tracked or ALL}
+        launch_tiles(dev, "raster/softmax", "softmax_weights", *view, hw=pairs.pixels, **shared)
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,
-        opacity,
-        early_stop,
-        max_tracked or ALL,
-        b.pair_scratch,
-        derivative,
+        shared["early_stop"] if is_alpha else 1 / gamma,
+        b.tile_shown,
+        b.transmittance,
+        b.mean_range,
+        b.is_covered,
+        state,
+        end,
+        None if is_alpha else b.sample_tracked,
+        b.pair_weight if records else None,
         b.point_is_visible,
         b.point_slot,
-        b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
-        sample_transmittance if blend == "alpha" else None,
-    )
-
-
-def listed_fragments(
-    pairs: Pairs, weights: BlendWeights
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Download the fragments in the order of pairs.pair_key: (P,) bool, False if the fragment is
-    dropped, and the uint32 points and float32 weights of all others.
-    """
-    offset = pairs.pixel_offset.get().astype(np.int64)
-    weight_point = weights.pixel_weight_point.get()[: pairs.total]
-    point = (weight_point & np.uint64(NO_POINT)).astype(np.uint32)
-    # entries behind NO_POINT in a pixel were never written
-    ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
-    is_listed = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
-    return (
-        is_listed,
-        point[is_listed],
-        (weight_point[is_listed] >> np.uint64(32)).astype(np.uint32).view(np.float32),
-    )
-
-
-def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
-    """Set pair_gradient, (P, 1 + samples) float32, to 0 at the pairs of visible points."""
-    count = weights.total
-    dev.program("raster/clear_pairs", SAMPLES=pair_gradient.shape[1] - 1).launch(
-        "clear_pairs",
-        count,
-        s=count,
-        visible=weights.visible_rows,
-        point_offset=pairs.point_offset,
-        pair_gradient=pair_gradient,
     )

@@ -5,7 +5,6 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.raster.weights import BlendWeights
 
@@ -19,7 +18,6 @@ def depth_gradient(
     dev: Device,
     b: Buffers,
     points: ProjectedPoints,
-    pairs: Pairs,
     weights: BlendWeights,
     size: tuple[int, int],
     *,
@@ -32,22 +30,22 @@ def depth_gradient(
 
     size: (H, W). voxel_size: world units.
     """
-    b.require(depth_loss_table(pairs.pixels))
+    pixels = size[0] * size[1]
+    b.require(depth_loss_table(pixels))
     program = dev.program("training/depth_loss", SIDE=points.side)
     program.launch(
         "pixel_surface",
-        pairs.pixels,
-        hw=pairs.pixels,
+        pixels,
+        hw=pixels,
         voxel_size=voxel_size,
         camera=points.camera_buffer,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        pixel_weight_point=weights.pixel_weight_point,
+        transmittance=weights.transmittance,
+        mean_range=weights.mean_range,
         surface=b.surface,
     )
     program.launch(
         "depth_gradient",
-        pairs.pixels,
+        pixels,
         h=size[0],
         w=size[1],
         weight=weight,

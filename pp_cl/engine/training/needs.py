@@ -1,5 +1,5 @@
 """Predicts a training's memory, within 15 %, from the tables of its buffers for the expected
-numbers of points, fragments and pixels.
+numbers of points, tiles and pixels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pp_cl.engine.model import REFINING_BYTES
 from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud, sh_blocks
-from pp_cl.engine.raster.project import footprint_pixels
+from pp_cl.engine.raster.project import tiles_of, touched_tiles
 from pp_cl.engine.render import point_radius, view_table
 from pp_cl.engine.training.crops import crop_side
 from pp_cl.engine.training.depth_loss import depth_loss_table
@@ -98,15 +98,16 @@ class Needs:
         downscale, halvings = config.scene.downscale, stretch.refinements
         crop = self._padded_size(downscale << halvings, crop_side(train.crop, halvings))
         image = self._padded_size(downscale, 0)
-        side, pixels = stretch.supersampling, math.prod(image)
+        side, dev = stretch.supersampling, self._net.dev
         pairs, plain = (
-            grown(0, round(n * min(footprint_pixels(radius, k), pixels))) for k in (side, 1)
+            grown(0, round(n * min(touched_tiles(radius, k), math.prod(tiles_of(image, k)))))
+            for k in (side, 1)
         )
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
-        share = min(1.0, CROP_SHARE * math.prod(crop) / pixels)
-        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
-        of_step = view_table(raster, n, *of_crop, training=True, supersampling=side)
-        of_preview = view_table(raster, n, pixels, pairs, visible, supersampling=side)
+        share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
+        of_crop = crop, round(share * pairs), round(share * visible)
+        of_step = view_table(dev, raster, n, *of_crop, training=True, supersampling=side)
+        of_preview = view_table(dev, raster, n, image, pairs, visible, supersampling=side)
 
         held: list[Table] = [
             PointCloud.table(n, sh_blocks(config.points.sh_degree)),
@@ -115,16 +116,16 @@ class Needs:
             smoothing_table(n if train.sh_smoothing > 0 else 0),
             self._net.table(crop, image),
             network_state_table(self._net.all_parameters.size, stretch.is_averaged),
-            loss_table(self._net.dev, crop, crop, train.ssim_weight),
+            loss_table(dev, crop, crop, train.ssim_weight),
             depth_loss_table(math.prod(crop) if train.depth_weight > 0 else 0),
             {"image": ((self._image_bytes,), np.uint8)},
         ]
         is_last, of_views = stretch.refinements == 0, [of_preview, target_table(image)]
         if is_last and train.specular == "auto" and raster.blend == "alpha":
-            of_views += [self._layer, fit_table(self._net.dev, self._pixels // downscale**2)]
+            of_views += [self._layer, fit_table(dev, self._pixels // downscale**2)]
         taking_turns = [[of_step, target_table(crop)], of_views]
         if is_last and train.prune_weight > 0:  # its views have one sample a pixel
-            taking_turns.append([view_table(raster, n, pixels, plain, 0, until="weights")])
+            taking_turns.append([view_table(dev, raster, n, image, plain, 0, until="weights")])
         device = _bytes(held) + max(map(_bytes, taking_turns))
         tables = [*held, *(table for turn in taking_turns for table in turn)]
         largest = max(table_bytes({"": row}) for table in tables for row in table.values())

@@ -18,6 +18,7 @@ from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.conv import PARTS_MACROS, GradientParts
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import BlendGradients
+from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.points import PointCloud, four_blocks, stored_degree
 from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.training.schedule import Rates
@@ -204,6 +205,7 @@ def rmsprop_update(
         MOVES_OFFSET=int(grad_offset is not None),
         MOST_OFFSET=f"{kind.most_offset}f",
         OFFSETS=kind.offsets,
+        RECORD=FOOTPRINTS[points.footprint].record,
         **({"MOST_SH": f"{kind.most_sh}f"} if kind.most_sh < math.inf else {}),
     )
     fits = program.kernels["rmsprop_move"].largest_group >= parts
@@ -223,7 +225,7 @@ def rmsprop_update(
         rate_lobe=root * rates.lobe,
         visible=visible,
         camera=points.camera_buffer,
-        point_camera=points.point_camera,
+        point_record=points.point_record,
         grad_visible_features=grad_visible_features,
         grad_offset=grad_offset,
         grad_opacity=grad_opacity,

@@ -5,7 +5,7 @@ import pytest
 from support.comparisons import relative_error
 
 from pp_cl.engine.device.buffers import Buffers
-from pp_cl.engine.raster.highest_weights import list_weights, record_weights
+from pp_cl.engine.raster.highest_weights import record_weights
 from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.engine.training.depth_loss import depth_gradient
 from pp_cl.reference import dense as oracle
@@ -79,7 +79,7 @@ def test_gradients_of_the_depth_loss_against_finite_differences(dev, rng):
     def loss(opacity):
         return bending(surface(opacity)[1].reshape(scene.shape), has_surface)[0]
 
-    view = scene.projected, scene.pairs, scene.weights, scene.shape
+    view = scene.projected, scene.weights, scene.shape
     depth_grad = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=1.0)
     gradients = scene.gradients(blended.grad, depth_gradient=depth_grad)["opacity"]
     inside = np.flatnonzero((opacity > 0) & (opacity < 1))
@@ -102,12 +102,11 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     scene = Blended(dev, rng, 31, kind=kind, rule="alpha").scene
     point = scene.seen[0]
     opacity = np.where(np.arange(31) == point, np.nan, 0.1)
-    scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha")
+    scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha", records=True)
     through = scene.weights.transmittance.get().ravel()
     np.testing.assert_array_equal(np.isnan(through), scene.fragments()[point])
     highest, times_seen = dev.zeros((31,)), dev.zeros((31,))
-    listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen)
+    record_weights(dev, scene.pairs, scene.weights, highest, times_seen)
     assert np.isnan(highest.get()[point])
 
 
