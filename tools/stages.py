@@ -22,7 +22,6 @@ from pp_cl.config import run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.network.unet import UNet
-from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
@@ -33,24 +32,25 @@ UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers
 WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features
 
 
-def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, sh: int) -> dict:
+def least_bytes(n: int, visible: int, pairs: int, shown: int, pixels: int, sh: int) -> dict:
     """{stage: bytes that it must read or write once}.
 
-    n: points. visible: those with a fragment before the early stop. fragments: pairs of a point and
-    a pixel. front: fragments before the early stop. sh: bytes of a point's SH coefficients.
+    n: points. visible: those that show in a sample. pairs: of a point and a tile. shown: those where
+    the point shows. sh: bytes of a point's SH coefficients.
     """
     cloud = 5 * WORD  # id and offset
-    projected = 8 * WORD  # axes, box, count, radius
+    record = 8 * WORD
+    key = 2 * WORD
     moved = 5 * WORD  # gradient; parameter and second moment, read and written
     return {
-        "project": n * (cloud + WORD) + visible * projected,
-        "pairs": visible * projected + fragments * 5 * WORD + pixels * WORD,
-        "weights": front * (2 + 2 + 1 + 2 + 1) * WORD,
+        "project": n * (cloud + WORD) + visible * record,
+        "pairs": visible * record + 3 * pairs * key,
+        "weights": pairs * key + shown * key + visible * record + 2 * pixels * WORD,
         "shade": visible * (sh + ROW),
-        "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
-        "backward": front * (2 + 2 + 1 + 2 + 1 + 2 + 2) * WORD
-        + (2 * visible + 2 * pixels) * ROW
-        + visible * 7 * WORD,
+        "blend": shown * key + visible * (record + ROW) + pixels * ROW,
+        "backward": shown * (key + 2 * (ROW + record))
+        + visible * (2 * ROW + 2 * record)
+        + pixels * ROW,
         "update": visible * (2 * sh + 3 * ROW + 2 * WORD + 5 * moved),
     }
 
@@ -58,9 +58,9 @@ def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, s
 def counts(result) -> dict:
     """The arguments of least_bytes() that depend on a rendered view."""
     pairs, weights = result.pairs, result.weights
-    front = int(listed_fragments(pairs, weights)[0].sum())
-    shown = {"visible": weights.visible.size, "fragments": pairs.total, "front": front}
-    return shown | {"n": pairs.points, "pixels": pairs.pixels}
+    shown = int(weights.tile_shown.get().sum())
+    found = {"visible": weights.visible.size, "pairs": pairs.total, "shown": shown}
+    return found | {"n": len(result.points.point_count), "pixels": pairs.pixels}
 
 
 def measure(scene: str, out: Path, preset: str | None) -> dict:

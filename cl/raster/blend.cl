@@ -20,18 +20,15 @@
 // (training/depth_loss.cl).
 #include "raster/compositing.h"
 
-#define SUMS 8  // of a pair beside the features: b, dL/do, and what derivatives_add() adds
-
 #ifndef MOVED
 #define MOVED MOVES  // 1: gradients of offsets, too
 #endif
+#include "raster/sums.h"
 
 // GROUP work-items per tile: read the points that show, nearest first, and their features, write
 // those of the tile's pixels.
 kernel void blend_forward(
     const uint tiles,                        //
-    const uint columns,                      // of tiles
-    const uint hw,                           // pixels
     const float limit,                       // early_stop, or 1 / gamma
     global const float *camera,              // (21) camera.h, of the samples
     global const uint *point_record,         // (N, RECORD) footprint.h
@@ -48,7 +45,7 @@ kernel void blend_forward(
     SHARED_LIST
     SHARED_FEATURES
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, limit);
     const uint begin = tile_offset[tile.number], end = begin + tile_shown[tile.number];
     Rays rays[OWN_BLOCKS];
@@ -57,7 +54,7 @@ kernel void blend_forward(
     float16 sums[OWN_BLOCKS * OWN_PIXELS];
     tile_rays(&tile, rays, inside);
     for (uint own = 0; own < OWN_BLOCKS; own++) {
-        SAMPLE_BEGIN(samples[own], &tile, own)
+        SAMPLE_BEGIN(samples[own], &tile, own, inside[own])
         for (uint k = 0; k < OWN_PIXELS; k++)
             sums[own * OWN_PIXELS + k] = 0.0f;
     }
@@ -138,9 +135,9 @@ typedef struct {
         for (uint row = 0; row < ROWS; row++)                                                      \
             sum += shared_rows[from + step * row];                                                 \
         if (i < CHANNELS)                                                                          \
-            ((global float *)(pair_features + pair))[i] = sum;                                     \
+            ((global float *)row_of_features)[i] = sum;                                            \
         else                                                                                       \
-            ((global float *)(pair_sums + pair))[i - CHANNELS] = sum;                              \
+            pair_sums[SUMS * (size_t)pair + i - CHANNELS] = sum;                                   \
         if (i == 0) pair_shows[pair] = 1;                                                          \
     }
 #else
@@ -183,8 +180,8 @@ typedef struct {
         }                                                                                          \
     }
 #define SUM_PAIR                                                                                   \
-    pair_features[pair] = of_point + of_others;                                                    \
-    pair_sums[pair] = sum_of_each(sums);                                                           \
+    *row_of_features = of_point + of_others;                                                       \
+    STORE_SUMS(sum_of_each(sums), pair, pair_sums);                                                \
     pair_shows[pair] = 1;
 
 // Values of the pixels of a block, for each sample.
@@ -197,8 +194,11 @@ ALWAYS_INLINE float16 of_samples(const float *of_pixels) {
 #endif
 }
 
-// The sums of 8 vectors.
-ALWAYS_INLINE float8 sum_of_each(const float16 v[8]) {
+// The sums of SUMS vectors.
+ALWAYS_INLINE Sums sum_of_each(const float16 v[SUMS]) {
+#if !MOVED
+    return (Sums)(sum16(v[0]), sum16(v[1]));
+#else
     float16 halves[4];
     for (int i = 0; i < 4; i++)
         halves[i] =
@@ -214,6 +214,7 @@ ALWAYS_INLINE float8 sum_of_each(const float16 v[8]) {
                          (float16)(a.s23, b.s23, a.s67, b.s67, a.sab, b.sab, a.sef, b.sef);
     const float8 sums = twos.even + twos.odd;  // of 0, 4, 2, 6, 1, 5, 3, 7
     return (float8)(sums.s0, sums.s4, sums.s2, sums.s6, sums.s1, sums.s5, sums.s3, sums.s7);
+#endif
 }
 #endif
 
@@ -266,8 +267,6 @@ ALWAYS_INLINE void gradients_load(
 // them is 1 / SAMPLES.
 kernel void blend_backward(
     const uint tiles,                        //
-    const uint columns,                      // of tiles
-    const uint hw,                           // pixels
     const float limit,                       // early_stop, or 1 / gamma
     const float distortion_weight,           // of a sample; 0: none, `distortion` is not written
     global const float *camera,              // (21) camera.h, of the samples
@@ -285,8 +284,9 @@ kernel void blend_backward(
     global const float16 *grad_features,     // (H, W, 16) G
     global const float *grad_alpha,          // (HW) g, may be NULL
     global const float2 *depth_gradient,     // (HW, 2) depth_loss.cl, may be NULL
-    global float16 *pair_features,           // (P, 16)
-    global float8 *pair_sums,                // (P, SUMS)
+    global float16 *pair_features,           // (P, 16) of points that may cover several tiles
+    global float16 *grad_visible_features,   // (?, 16) of the others, a row for each visible point
+    global float *pair_sums,                 // (P, SUMS)
     global uchar *pair_shows,                // (P) 1 where they are written; cleared before
     global float *distortion)                // (TILES)
 {
@@ -295,7 +295,7 @@ kernel void blend_backward(
     SHARED_SUMS
     SHARED(float, shared, GROUP);
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, limit);
     const uint begin = tile_offset[tile.number], count = tile_shown[tile.number];
     Rays rays[OWN_BLOCKS];
@@ -311,7 +311,7 @@ kernel void blend_backward(
     for (uint own = 0; own < OWN_BLOCKS && count > 0; own++) {
         const size_t row = SAMPLE_ROW(&tile, own);
 #if SOFTMAX
-        SAMPLE_BEGIN(samples[own], &tile, own)
+        SAMPLE_BEGIN(samples[own], &tile, own, inside[own])
 #else
         samples[own].T = SAMPLE_VALUES(const floats, sample_state, row);
         front_sum[own] = SAMPLE_VALUES(const floats, sample_state, sum_row + row);
@@ -333,9 +333,12 @@ kernel void blend_backward(
             const uint blocks = (uint)(entry >> 32);
             const uint pair = pair_of(&point, &tile, point_offset[(uint)entry]);
             const float range = DEPTH(&point), z = range - nearest;
+            global float16 *row_of_features = IS_IN_ONE_TILE(point)
+                                                  ? grad_visible_features + point_slot[(uint)entry]
+                                                  : pair_features + pair;
             FEATURE_ROW
             floats sums[SUMS];
-            for (uint s = 0; s < SUMS; s++)
+            UNROLLED_FOR (uint s = 0; s < SUMS; s++)
                 sums[s] = 0.0f;
             ADD_PIXELS_OF_POINT;
             FOR_BLOCKS(own, blocks) {

@@ -57,7 +57,8 @@ typedef struct {
     ints end;  // fragments from this rank on are dropped
 } Sample;
 
-#define SAMPLE_BEGIN(s, tile, own)                                                                 \
+// inside: the samples in the image; the others see nothing.
+#define SAMPLE_BEGIN(s, tile, own, inside)                                                         \
     (s).M = SAMPLE_VALUES(const floats, sample_state, SAMPLE_ROW(tile, own));                      \
     (s).per_D =                                                                                    \
         SAMPLE_VALUES(const floats, sample_state, SAMPLE_ROW(tile, own) + BLOCKS * (size_t)tiles); \
@@ -96,7 +97,7 @@ typedef struct {
     floats T;
 } Sample;
 
-#define SAMPLE_BEGIN(s, tile, own) (s).T = 1.0f;
+#define SAMPLE_BEGIN(s, tile, own, inside) (s).T = select((floats)(-1.0f), (floats)(1.0f), inside);
 
 // The alphas of a point where it shows in samples with T in front, 0 elsewhere.
 ALWAYS_INLINE floats alpha_of(const Point *p, const Coverage *at, ints *shows) {

@@ -15,8 +15,6 @@
 // it dropped would let less than the stop pass.
 kernel void depth_forward(
     const uint tiles,                  //
-    const uint columns,                // of tiles
-    const uint hw,                     // pixels
     const float limit,                 // early_stop, or 1 / gamma
     const float voxel_size,            // world units
     global const float *camera,        // (21) camera.h, of the samples
@@ -32,7 +30,7 @@ kernel void depth_forward(
 {
     SHARED_LIST
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, limit);
     const uint begin = tile_offset[tile.number], end = begin + tile_shown[tile.number];
     Rays rays[OWN_BLOCKS];
@@ -47,7 +45,7 @@ kernel void depth_forward(
     }
     for (uint pass = 0; pass < 2; pass++) {
         for (uint own = 0; own < OWN_BLOCKS; own++) {
-            SAMPLE_BEGIN(samples[own], &tile, own)
+            SAMPLE_BEGIN(samples[own], &tile, own, inside[own])
         }
         for (uint first = begin, batch; first < end; first += batch) {
             batch = BATCH(end - first);

@@ -7,8 +7,6 @@
 // of its falloffs where it covers samples, the mean of its weights, and whether it is not dropped.
 kernel void fragments_list(
     const uint tiles,                  //
-    const uint columns,                // of tiles
-    const uint hw,                     // pixels
     const float limit,                 // early_stop, or 1 / gamma
     const int is_listed,               // 0: fragments are only counted
     global const float *camera,        // (21) camera.h, of the samples
@@ -29,7 +27,7 @@ kernel void fragments_list(
 {
     SHARED_LIST
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, limit);
     const uint begin = tile_offset[tile.number], end = tile_offset[tile.number + 1];
     Rays rays[OWN_BLOCKS];
@@ -38,7 +36,7 @@ kernel void fragments_list(
     uint counts[OWN_BLOCKS * OWN_PIXELS], shown_counts[OWN_BLOCKS * OWN_PIXELS];
     tile_rays(&tile, rays, inside);
     for (uint own = 0; own < OWN_BLOCKS; own++) {
-        SAMPLE_BEGIN(samples[own], &tile, own)
+        SAMPLE_BEGIN(samples[own], &tile, own, inside[own])
         for (uint k = 0; k < OWN_PIXELS; k++)
             counts[own * OWN_PIXELS + k] = shown_counts[own * OWN_PIXELS + k] = 0;
     }

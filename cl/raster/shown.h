@@ -4,10 +4,6 @@
 
 #include "raster/compositing.h"
 
-#ifndef RECORDS
-#define RECORDS 0  // 1: the sums of the weights of each pair
-#endif
-
 // The list of the points that show: an entry is blocks << 32 | point. CPUs leave out those without a
 // block; on GPUs all members write the entries of a batch.
 #if GROUP > 1

@@ -1,4 +1,4 @@
-// weights.cl for the softmax: one walk for M, D and where samples stop, one for the weights.
+// weights.cl for the softmax: the walk for M, D and where samples stop.
 #define SOFTMAX 1
 #include "raster/shown.h"
 
@@ -11,8 +11,6 @@
 // weight; differs from Pulsar: it looks only when its buffer is flushed.
 kernel void softmax_weights(
     const uint tiles,                 //
-    const uint columns,               // of tiles
-    const uint hw,                    // pixels
     const uint p,                     // capacity, in pairs
     const float sharpness,            // 1 / gamma
     const float early_stop,           // 0: none
@@ -28,15 +26,12 @@ kernel void softmax_weights(
     global int *is_covered,           // (?, ?) parts of 4 x 4 pixels
     global float *sample_state,       // (2, ?, 16) M, 1/D
     global int *sample_end,           // (?, 16) rank behind the last that shows
-    global int *sample_tracked,       // (?, 16) rank behind the last with gradients
-    global const uint *point_offset,  // (N+1) first pair of each point; NULL without RECORDS
-    global float *pair_weight)        // (P) sums of weights, cleared before; NULL alike
+    global int *sample_tracked)       // (?, 16) rank behind the last with gradients
 {
     SHARED_LIST
     SHARED_BLOCKS
-    SHARED(float, shared_sum, GROUP);
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, sharpness);
     const uint begin = tile_offset[tile.number];
     const uint end = tile_offset[tiles] > p ? begin : tile_offset[tile.number + 1];
@@ -44,29 +39,27 @@ kernel void softmax_weights(
     Rays rays[OWN_BLOCKS];
     Sample samples[OWN_BLOCKS];
     floats D[OWN_BLOCKS];
-    ints ends[OWN_BLOCKS], tracked_ends[OWN_BLOCKS], counts[OWN_BLOCKS], inside[OWN_BLOCKS];
-    const uint all = tile_rays(&tile, rays, inside);
+    ints ends[OWN_BLOCKS], tracked_ends[OWN_BLOCKS], counts[OWN_BLOCKS], is_live[OWN_BLOCKS];
+    uint live = tile_rays(&tile, rays, is_live), rank = 0;
     for (uint own = 0; own < OWN_BLOCKS; own++) {
         samples[own].M = background;
-        samples[own].end = select((ints)(0), (ints)(INT_MAX), inside[own]);
         D[own] = 1.0f;  // the background alone
         ends[own] = tracked_ends[own] = counts[own] = 0;
     }
-    // M, D and where samples stop, as places in the list of all points
-    uint live = all;
     for (uint first = begin, batch; first < end && ANY_MEMBER(live); first += batch) {
         batch = BATCH(end - first);
+        BEGIN_BLOCKS
         READ_BATCH(pair_key[first + k])
         for (uint k = 0; k < batch && !IS_DONE(live); k++) {
             READ_POINT_AHEAD(pair_key[min(first + k + PAIRS_AHEAD, end - 1)])
             const ulong key = ENTRY(pair_key[first + k]);
             const Point point = POINT(key);
             const float z = normalised_depth(&rule, &point), o_z = point.opacity * z;
-            const int place = first + k - begin;
+            uint blocks = 0;
             FOR_BLOCKS(own, blocks_of(&point, &tile) & live) {
                 Sample *s = samples + own;
                 const Coverage at = coverage_at(rays + own, &point);
-                ints shows = at.covers & (s->end == INT_MAX);
+                ints shows = at.covers & is_live[own];
                 const ints weighs = shows & (at.falloff > 0.0f);
                 const floats M = select(s->M, fmax(s->M, o_z * sharpness), weighs);
                 if (any_sample(M > s->M)) {
@@ -77,48 +70,18 @@ kernel void softmax_weights(
                     const floats best =
                         exp(fma((floats)(fmax(z, 0.0f)), (floats)(sharpness), -s->M));
                     const ints stops = shows & (best < least * D[own]);
-                    s->end = select(s->end, (ints)(place), stops);
+                    is_live[own] &= ~stops;
                     shows &= ~stops;
-                    if (!any_sample(s->end == INT_MAX)) live &= ~(1u << BLOCK(own));
+                    if (!any_sample(is_live[own])) live &= ~(1u << BLOCK(own));
                 }
                 const floats term = point.opacity * at.falloff * exponential(o_z, sharpness, s->M);
                 D[own] += select((floats)(0.0f), term, shows);
-            }
-        }
-    }
-    for (uint own = 0; own < OWN_BLOCKS; own++)
-        samples[own].per_D = 1.0f / D[own];
-    uint rank = 0;
-    live = all;
-    for (uint first = begin, batch; first < end && ANY_MEMBER(live); first += batch) {
-        batch = BATCH(end - first);
-        BEGIN_BLOCKS
-        READ_BATCH(pair_key[first + k])
-        for (uint k = 0; k < batch && !IS_DONE(live); k++) {
-            READ_POINT_AHEAD(pair_key[min(first + k + PAIRS_AHEAD, end - 1)])
-            const ulong key = ENTRY(pair_key[first + k]);
-            const Point point = POINT(key);
-            const int place = first + k - begin;
-            uint blocks = 0;
-            floats of_pair = 0.0f;
-            FOR_BLOCKS(own, blocks_of(&point, &tile) & live) {
-                const Coverage at = coverage_at(rays + own, &point);
-                ints shows;
-                const floats b = weigh(samples + own, &rule, &point, &at, place, &shows);
-                if (RECORDS) of_pair += b;
-                const ints one = (ints)(1);
-                counts[own] += select((ints)(0), one, shows);
+                counts[own] += select((ints)(0), (ints)(1), shows);
                 ends[own] = select(ends[own], (ints)(rank + 1), shows);
                 tracked_ends[own] = select(
                     tracked_ends[own], (ints)(rank + 1),
                     shows & (LANED(convert_uint)(counts[own]) <= tracked));
                 ADD_BLOCK(own, shows)
-                if (!any_sample(samples[own].end > place)) live &= ~(1u << BLOCK(own));
-            }
-            if (RECORDS) {
-                const float sum = group_sum(SUM_LANES(of_pair), shared_sum);
-                if (MEMBER == 0 && sum != 0.0f)
-                    pair_weight[pair_of(&point, &tile, point_offset[(uint)key])] = sum;
             }
             END_ENTRY
         }
@@ -129,12 +92,13 @@ kernel void softmax_weights(
     store_covered(&tile, ALL_COVERED, is_covered);
     for (uint own = 0; own < OWN_BLOCKS; own++) {
         const size_t row = SAMPLE_ROW(&tile, own);
+        const floats per_D = 1.0f / D[own];
         SAMPLE_VALUES(floats, sample_state, row) = samples[own].M;
-        SAMPLE_VALUES(floats, sample_state, row + BLOCKS * (size_t)tiles) = samples[own].per_D;
+        SAMPLE_VALUES(floats, sample_state, row + BLOCKS * (size_t)tiles) = per_D;
         SAMPLE_VALUES(ints, sample_end, row) = ends[own];
         SAMPLE_VALUES(ints, sample_tracked, row) = tracked_ends[own];
         float rest[OWN_PIXELS];
-        sum_pixels(exp(background - samples[own].M) * samples[own].per_D, rest);
+        sum_pixels(exp(background - samples[own].M) * per_D, rest);
         FOR_PIXELS(k) {
             const uint q = pixel_of(&tile, own, k);
             if (q != NONE) transmittance[q] = rest[OF_PIXEL(k)];

@@ -39,11 +39,12 @@ typedef struct {
     uint number;
 } Tile;
 
-ALWAYS_INLINE Tile tile_load(global const float *camera, const uint number, const uint columns) {
+ALWAYS_INLINE Tile tile_load(global const float *camera, const uint number) {
     Tile tile;
     tile.cam = camera_load(camera);
     tile.width = tile.cam.width / SIDE;
     tile.height = tile.cam.height / SIDE;
+    const uint columns = (tile.width + TILE_SIDE - 1) / TILE_SIDE;
     tile.x = number % columns * TILE_SIDE;
     tile.y = number / columns * TILE_SIDE;
     tile.number = number;

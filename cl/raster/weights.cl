@@ -11,8 +11,6 @@
 // of what shows by its weights, and whether its part of the image shows anything.
 kernel void alpha_weights(
     const uint tiles,                 //
-    const uint columns,               // of tiles
-    const uint hw,                    // pixels
     const uint p,                     // capacity, in pairs
     const float early_stop,           // T behind which fragments are dropped, at least 1e-20
     global const float *camera,       // (21) camera.h, of the samples
@@ -26,15 +24,12 @@ kernel void alpha_weights(
     global float *mean_range,         // (HW) distance from the eye; 0 where nothing shows
     global int *is_covered,           // (?, ?) parts of 4 x 4 pixels
     global float *sample_state,  // (2, ?, 16) T, sum b (range - nearest); NULL without DERIVATIVES
-    global int *sample_end,      // (?, 16) rank behind the last that shows; NULL alike
-    global const uint *point_offset,  // (N+1) first pair of each point; NULL without RECORDS
-    global float *pair_weight)        // (P) sums of weights, cleared before; NULL alike
+    global int *sample_end)      // (?, 16) rank behind the last that shows; NULL alike
 {
     SHARED_LIST
     SHARED_BLOCKS
-    SHARED(float, shared_sum, GROUP);
     if (GROUP_ID >= tiles) return;
-    const Tile tile = tile_load(camera, GROUP_ID, columns);
+    const Tile tile = tile_load(camera, GROUP_ID);
     const Rule rule = rule_of(&tile.cam, early_stop);
     const uint begin = tile_offset[tile.number];
     const uint end = tile_offset[tiles] > p ? begin : tile_offset[tile.number + 1];
@@ -44,7 +39,7 @@ kernel void alpha_weights(
     ints ends[OWN_BLOCKS], inside[OWN_BLOCKS];
     uint live = tile_rays(&tile, rays, inside), rank = 0;
     for (uint own = 0; own < OWN_BLOCKS; own++) {
-        samples[own].T = select((floats)(-1.0f), (floats)(1.0f), inside[own]);
+        SAMPLE_BEGIN(samples[own], &tile, own, inside[own])
         ranges[own] = 0.0f;
         ends[own] = 0;
     }
@@ -60,21 +55,14 @@ kernel void alpha_weights(
             const Point point = POINT(key);
             const float range = upper_float(key) - nearest;
             uint blocks = 0;
-            floats of_pair = 0.0f;
             FOR_BLOCKS(own, blocks_of(&point, &tile) & live) {
                 const Coverage at = coverage_at(rays + own, &point);
                 ints shows;
                 const floats b = weigh(samples + own, &rule, &point, &at, rank, &shows);
                 ranges[own] += b * range;
                 if (DERIVATIVES) ends[own] = select(ends[own], (ints)(rank + 1), shows);
-                if (RECORDS) of_pair += b;
                 ADD_BLOCK(own, shows)
                 if (!any_sample(samples[own].T >= early_stop)) live &= ~(1u << BLOCK(own));
-            }
-            if (RECORDS) {
-                const float sum = group_sum(SUM_LANES(of_pair), shared_sum) / SAMPLES;
-                if (MEMBER == 0 && sum != 0.0f)
-                    pair_weight[pair_of(&point, &tile, point_offset[(uint)key])] = sum;
             }
             END_ENTRY
         }

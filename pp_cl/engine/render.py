@@ -27,7 +27,7 @@ from pp_cl.engine.raster.blend import (
 )
 from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.fragments import count_fragments
-from pp_cl.engine.raster.highest_weights import record_weights
+from pp_cl.engine.raster.highest_weights import record_weights, recording_table
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
 from pp_cl.engine.raster.project import (
     ProjectedPoints,
@@ -78,13 +78,12 @@ def view_table(
     """
     records, side = until == "weights", supersampling
     (rows, columns), kind = tiles_of(size, side), (settings.blend, settings.footprint)
-    recorded = pairs if records else 0
     table = projection_table(n, settings.footprint)
     table |= pairs_table(dev, n, size, pairs, side, by_point=training or records)
-    table |= weights_table(n, size, settings.blend, side, derivatives=training, pairs=recorded)
+    table |= weights_table(n, size, settings.blend, side, derivatives=training)
     table["features"] = (*size, 16), np.float32
     if records:
-        return table
+        return table | recording_table(pairs)
     table["visible_features"] = (visible, 16), np.float32
     if training:
         table |= blend_backward_table(visible, pairs, rows * columns, *kind)
@@ -257,7 +256,7 @@ class Renderer:
                 side=side,
             )
         is_planned = net.is_planned(size)
-        options = gamma, early_stop, training, until == "weights", times_seen
+        options = gamma, early_stop, training, by_pair, times_seen
         pairs, weights, tile_mask = self._pairs_and_weights(points, size, is_planned, *options)
         view = camera, (left, top), size
         result = RenderResult(dev, *view, points, pairs, weights, tile_mask, side)
@@ -290,7 +289,7 @@ class Renderer:
         return result
 
     def _pairs_and_weights(
-        self, points, size, is_planned, gamma, early_stop, training, records, times_seen
+        self, points, size, is_planned, gamma, early_stop, training, by_point, times_seen
     ):
         """(Pairs, BlendWeights, RenderResult.tile_mask or None unless is_planned). Both stages are
         enqueued before the number of pairs is known, and run again with more capacity if it was too
@@ -299,7 +298,6 @@ class Renderer:
         settings, capacity, b = self.settings, self._capacities[self._by_pair], self._buffers
         while True:
             with self.dev.stage("pairs"):
-                by_point = training or records
                 pairs = find_pairs(self.dev, b, points, size, capacity.pairs, times_seen, by_point)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
@@ -313,7 +311,6 @@ class Renderer:
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
-                    records=records,
                 )
                 weights.read_count(self.dev)
             tile_mask = weights.read_covered(self.dev) if is_planned else None
@@ -407,8 +404,8 @@ class Renderer:
         """Update max_weight and times_seen by the last forward(until="weights"), as
         highest_weights.py has it.
         """
-        view = result.pairs, result.weights
-        record_weights(self.dev, *view, max_weight, times_seen, least)
+        view = result.points, result.pairs, result.weights
+        record_weights(self.dev, self._buffers, *view, max_weight, times_seen, least)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of a camera, clamped to [0, 1]. options: for forward()."""

@@ -426,11 +426,10 @@ def _depths(dev, scene, voxel_size=0.0):
 
 def _record(rule, dev, rng):
     """Each point's highest weight, also as the backward pass finds it, and how often it is seen."""
-    drops = {"early_stop": 0.05, "records": True}
-    blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)
+    blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, early_stop=0.05)
     before, times_seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
-    view = dev, scene.pairs, scene.weights
+    view = dev, scene.buffers, scene.projected, scene.pairs, scene.weights
     record_weights(*view, highest, times_seen)
     has_pairs = scene.projected.point_count.get() > 0
     yield exact(times_seen.get() - np.arange(500), has_pairs)

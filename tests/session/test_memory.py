@@ -168,13 +168,6 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     assert last.points == 600_000
 
 
-def test_views_that_decide_on_pruning_have_one_sample_a_pixel(dev):
-    """They take the most memory where images are much larger than crops."""
-    few = {"train__iterations": "24", "size": (1600, 1200)}
-    single, four = (needed(dev, train__supersampled=share, **few) for share in ("0", "0.25"))
-    assert four.device == single.device
-
-
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
     made = memory_plan(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
     finer = Grid(GRID.origin, GRID.voxel_size / 2, tuple(2 * n for n in GRID.dims))

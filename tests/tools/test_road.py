@@ -19,7 +19,7 @@ def test_the_page_is_what_a_step_calls(plain):
     ],
 )
 def test_headers_are_listed_if_a_kernel_is_built_with_them(macros, built, others):
-    path = road.kernel_folder() / "raster" / "alpha.cl"
+    path = road.kernel_folder() / "raster" / "weights.cl"
     files = road.kernel_files(path, macros)
     names = {file.name for file in files}
     assert built <= names and not others & names

@@ -70,7 +70,6 @@ def blend_forward(
         "blend_forward",
         points,
         pairs,
-        hw=pairs.pixels,
         point_slot=weights.point_slot,
         visible_features=visible_features,
         transmittance=weights.transmittance,
@@ -80,20 +79,21 @@ def blend_forward(
 
 
 def blend_backward_table(
-    visible: int, pairs: int, tiles: int, blend: str, footprint: str = "soft"
+    visible: int, pairs: int, tiles: int, blend: str, footprint: str = "soft", moves: bool = True
 ) -> Table:
     """The buffers of the backward pass for capacities of visible points and of pairs, and a number
-    of tiles. blend: one of BLENDS.
+    of tiles. blend: one of BLENDS. moves: with gradients of offsets, if these points have any.
     """
+    moves = moves and blend == "alpha" and FOOTPRINTS[footprint].moves
     table: Table = {
         "pair_features": ((pairs, 16), np.float32),
-        "pair_sums": ((pairs, 8), np.float32),
+        "pair_sums": ((pairs, 8 if moves else 2), np.float32),
         "pair_shows": ((pairs,), np.uint8),
         "grad_visible_features": ((visible, 16), np.float32),
         "grad_opacity": ((visible,), np.float32),
         "distortion": ((tiles,), np.float32),
     }
-    if blend == "softmax":
+    if not moves:
         return table
     return table | {"grad_offset": ((visible, FOOTPRINTS[footprint].offsets), np.float32)}
 
@@ -152,12 +152,13 @@ def blend_backward(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
     capacities = len(visible_features), pairs.capacity, len(weights.tile_shown)
-    b.require(blend_backward_table(*capacities, weights.blend, points.footprint))
+    b.require(blend_backward_table(*capacities, weights.blend, points.footprint, moves))
     dev.fill(b.pair_shows, 0)
     of_pairs: dict[str, Any] = {
         "point_offset": pairs.point_offset,
         "visible_features": visible_features,
         "pair_features": b.pair_features,
+        "grad_visible_features": b.grad_visible_features,
         "pair_sums": b.pair_sums,
         "pair_shows": b.pair_shows,
     }
@@ -168,7 +169,6 @@ def blend_backward(
         points,
         pairs,
         defines={"SOFTMAX": int(not is_alpha), "MOVED": int(moves)},
-        hw=pairs.pixels,
         limit=weights.limit,
         pair_key=pairs.pair_key,
         distortion_weight=distortion_weight,
@@ -194,7 +194,6 @@ def blend_backward(
         camera=points.camera_buffer,
         point_record=points.point_record,
         cloud_offset=points.cloud_offset,
-        grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
         grad_offset=b.grad_offset if moves else None,
         max_weight=max_weight,

@@ -32,7 +32,6 @@ def depth_forward(
         "depth_forward",
         points,
         pairs,
-        hw=pairs.pixels,
         voxel_size=voxel_size,
         pixel_alpha=alpha.reshape(-1),
         pixel_depth=depth.reshape(-1),

@@ -92,7 +92,6 @@ def _launch(dev, points, pairs, weights, **listed):
         "fragments_list",
         points,
         pairs,
-        hw=pairs.pixels,
         pair_key=pairs.pair_key,
         is_listed=int(bool(listed)),
         pixel_count=counts,

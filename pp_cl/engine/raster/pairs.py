@@ -178,17 +178,16 @@ def launch_tiles(
     describes. arguments: by parameter name, apart from those that all of them have; defines: macros
     of the program.
     """
-    samples, (rows, columns) = points.side**2, pairs.tiles
+    samples, tiles = points.side**2, pairs.tiles[0] * pairs.tiles[1]
     defines = {"LANES": lanes(dev, samples), **points.macros(), **arguments.pop("defines", {})}
     launch_groups(
         dev,
         name,
         kernel,
-        rows * columns,
+        tiles,
         most=TILE_SAMPLES // samples,
         defines=defines,
-        tiles=rows * columns,
-        columns=columns,
+        tiles=tiles,
         camera=points.camera_buffer,
         point_record=points.point_record,
         tile_offset=pairs.tile_offset,

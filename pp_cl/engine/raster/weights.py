@@ -38,8 +38,7 @@ class BlendWeights:
     sample_state: (2, BLOCKS, 16) float32, of alpha compositing, with derivatives: the transmittance
     behind all and the sum of weights times distances; of the softmax M and 1/D. sample_end: int32
     (BLOCKS, 16), how many of the tile's points are before a sample's early stop; sample_tracked:
-    those that get gradients. pair_weight: (P,) float32, the sum of each pair's weights; None if not
-    asked for.
+    those that get gradients.
 
     point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, the index of a
     visible point in `visible`, undefined for others. visible_rows: (N,) uint32, begins with
@@ -56,7 +55,6 @@ class BlendWeights:
     sample_state: Array | None
     sample_end: Array | None
     sample_tracked: Array | None
-    pair_weight: Array | None
     point_is_visible: Array
     point_slot: Array
     visible_rows: Array
@@ -98,10 +96,10 @@ class BlendWeights:
 
 
 def weights_table(
-    n: int, size: tuple[int, int], blend: str, side: int = 1, *, derivatives: bool, pairs: int = 0
+    n: int, size: tuple[int, int], blend: str, side: int = 1, *, derivatives: bool
 ) -> Table:
     """The buffers for n points and an image of size (height, width) with side x side samples a
-    pixel. pairs: the capacity of pairs if their weights are recorded, else 0.
+    pixel.
     """
     (rows, columns), pixels = tiles_of(size, side), size[0] * size[1]
     samples = rows * columns * TILE_SAMPLES // 16, 16
@@ -119,8 +117,6 @@ def weights_table(
         table |= {"sample_state": ((2, *samples), np.float32), "sample_end": (samples, np.int32)}
     if blend == "softmax":
         table["sample_tracked"] = samples, np.int32
-    if pairs:
-        table["pair_weight"] = (pairs,), np.float32
     return table
 
 
@@ -136,7 +132,6 @@ def blend_weights(
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
-    records: bool = False,
 ) -> BlendWeights:
     """The weights of these pairs' fragments, in the buffers b of find_pairs(), whose `shown` is
     written.
@@ -146,17 +141,11 @@ def blend_weights(
     pixel get gradients (64 in the paper); 0: all. early_stop: in [0, 1): a sample drops all
     fragments behind the depth where no fragment can have this share any more (0.001 in the paper);
     0: none, of alpha compositing LEAST_STOP. derivatives: write what the backward pass reads.
-    records: write pair_weight, for pairs numbered by point. read_count() downloads the number of
-    visible points.
+    read_count() downloads the number of visible points.
     """
     n, is_alpha = len(points.point_count), blend == "alpha"
-    recorded = pairs.capacity if records else 0
-    b.require(
-        weights_table(n, pairs.size, blend, points.side, derivatives=derivatives, pairs=recorded)
-    )
+    b.require(weights_table(n, pairs.size, blend, points.side, derivatives=derivatives))
     dev.fill(b.point_is_visible, 0)
-    if records:
-        dev.fill(b.pair_weight, 0)
     keeps = derivatives or not is_alpha
     state, end = (b.sample_state, b.sample_end) if keeps else (None, None)
     shared: dict[str, Any] = {
@@ -167,21 +156,17 @@ def blend_weights(
         "point_is_visible": b.point_is_visible,
         "transmittance": b.transmittance,
         "is_covered": b.is_covered,
-        "point_offset": pairs.point_offset if records else None,
-        "pair_weight": b.pair_weight if records else None,
         "sample_state": state,
         "sample_end": end,
     }
-    macros, view = {"RECORDS": int(records)}, (points, pairs)
+    view = points, pairs
     if is_alpha:
-        macros["DERIVATIVES"] = int(derivatives)
-        shared |= {"defines": macros, "mean_range": b.mean_range}
-        launch_tiles(dev, "raster/weights", "alpha_weights", *view, hw=pairs.pixels, **shared)
+        shared |= {"defines": {"DERIVATIVES": int(derivatives)}, "mean_range": b.mean_range}
+        launch_tiles(dev, "raster/weights", "alpha_weights", *view, **shared)
     else:
-        macros["DROPS"] = int(early_stop > 0)
-        shared |= {"defines": macros, "sample_tracked": b.sample_tracked}
+        shared |= {"defines": {"DROPS": int(early_stop > 0)}, "sample_tracked": b.sample_tracked}
         shared |= {"sharpness": 1 / gamma, "tracked": max_tracked or ALL}
-        launch_tiles(dev, "raster/softmax", "softmax_weights", *view, hw=pairs.pixels, **shared)
+        launch_tiles(dev, "raster/softmax", "softmax_weights", *view, **shared)
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,
@@ -193,7 +178,6 @@ def blend_weights(
         state,
         end,
         None if is_alpha else b.sample_tracked,
-        b.pair_weight if records else None,
         b.point_is_visible,
         b.point_slot,
         b.visible,

@@ -99,10 +99,8 @@ class Needs:
         crop = self._padded_size(downscale << halvings, crop_side(train.crop, halvings))
         image = self._padded_size(downscale, 0)
         side, dev = stretch.supersampling, self._net.dev
-        pairs, plain = (
-            grown(0, round(n * min(touched_tiles(radius, k), math.prod(tiles_of(image, k)))))
-            for k in (side, 1)
-        )
+        tiles = math.prod(tiles_of(image, side))
+        pairs = grown(0, round(n * min(touched_tiles(radius, side), tiles)))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
         of_crop = crop, round(share * pairs), round(share * visible)
@@ -124,8 +122,6 @@ class Needs:
         if is_last and train.specular == "auto" and raster.blend == "alpha":
             of_views += [self._layer, fit_table(dev, self._pixels // downscale**2)]
         taking_turns = [[of_step, target_table(crop)], of_views]
-        if is_last and train.prune_weight > 0:  # its views have one sample a pixel
-            taking_turns.append([view_table(dev, raster, n, image, plain, 0, until="weights")])
         device = _bytes(held) + max(map(_bytes, taking_turns))
         tables = [*held, *(table for turn in taking_turns for table in turn)]
         largest = max(table_bytes({"": row}) for table in tables for row in table.values())

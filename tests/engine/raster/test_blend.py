@@ -102,11 +102,12 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     scene = Blended(dev, rng, 31, kind=kind, rule="alpha").scene
     point = scene.seen[0]
     opacity = np.where(np.arange(31) == point, np.nan, 0.1)
-    scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha", records=True)
+    scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha")
     through = scene.weights.transmittance.get().ravel()
     np.testing.assert_array_equal(np.isnan(through), scene.fragments()[point])
     highest, times_seen = dev.zeros((31,)), dev.zeros((31,))
-    record_weights(dev, scene.pairs, scene.weights, highest, times_seen)
+    view = scene.projected, scene.pairs, scene.weights
+    record_weights(dev, scene.buffers, *view, highest, times_seen)
     assert np.isnan(highest.get()[point])
 
 
