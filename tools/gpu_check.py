@@ -37,6 +37,8 @@ from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.selftest.run import CASES, run_cases
 
+POCL = "Portable Computing Language"  # Intel's CPU runtime miscompiles the GPU form
+
 TARGETS = ("sm_90", "gfx1100", "dg2")  # Hopper, RDNA 3, Arc
 MOST_LOCAL = 32768  # bytes: Adreno, Mali, Apple's and older Intel GPUs have no more
 FOLDER = Path(__file__).parents[1] / "build" / "gpu"
@@ -87,10 +89,11 @@ def recorded() -> Iterator[dict[Build, set[str]]]:
 
 def record() -> dict[Build, set[str]]:
     """Record what the selftest and two trainings (both blends, the paper's network) build and
-    launch in the form for GPUs. Raises RuntimeError if one of them fails.
+    launch in the form for GPUs, on PoCL. Raises RuntimeError if one of them fails, UserError
+    without PoCL.
     """
     with (
-        patch.dict(os.environ, {"PP_FORM": "gpu"}),
+        patch.dict(os.environ, {"PP_FORM": "gpu", "PP_DEVICE": POCL}),
         TemporaryDirectory() as folder,
         recorded() as builds,
     ):

@@ -66,7 +66,7 @@ typedef struct {
 
 // exp(a - M), where a = o z / gamma is above M by more than a rounding only where d = 0.
 ALWAYS_INLINE floats exponential(const float o_z, const float sharpness, const floats M) {
-    return exp(fmin(fma((floats)(o_z), (floats)(sharpness), -M), 0.0f));
+    return exp(fmin(-fma((floats)(-o_z), (floats)(sharpness), M), 0.0f));
 }
 
 // b / o of the point with this rank in the list, or 0, and the samples in which it is not dropped.

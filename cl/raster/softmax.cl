@@ -68,7 +68,7 @@ kernel void softmax_weights(
                 }
                 if (DROPS) {
                     const floats best =
-                        exp(fma((floats)(fmax(z, 0.0f)), (floats)(sharpness), -s->M));
+                        exp(-fma((floats)(-fmax(z, 0.0f)), (floats)(sharpness), s->M));
                     const ints stops = shows & (best < least * D[own]);
                     is_live[own] &= ~stops;
                     shows &= ~stops;

@@ -54,7 +54,7 @@ ALWAYS_INLINE Coverage coverage_at(const Rays *m, const Point *p) {
     const float reach = fabs(p->size), reach2 = reach * reach, per_reach = 1.0f / reach;
     Coverage at;
     at.x = FMA(-c.z, m->y, c.y);
-    at.y = FMA(c.z, m->x, -c.x);
+    at.y = -FMA(-c.z, m->x, c.x);
     at.z = FMA(-c.y, m->x, c.x * m->y);
     // above 0, so that it has a root to divide by
     const floats across2 = FMA(at.x, at.x, FMA(at.y, at.y, FMA(at.z, at.z, 1e-30f)));

@@ -25,9 +25,9 @@ ALWAYS_INLINE void derivatives_add(
     const floats most = MOST_PER_REST / fabs(p->size);
     u = shift * select(u, most, u > most) * (m->per_length * m->per_length);
     sums[0] += shift * at->rest;
-    sums[1] += u * (m->y * at->z - at->y);
-    sums[2] += u * (at->x - m->x * at->z);
-    sums[3] += u * (m->x * at->y - m->y * at->x);
+    sums[1] -= u * FMA(-m->y, at->z, at->y);
+    sums[2] += u * FMA(-m->x, at->z, at->x);
+    sums[3] += u * FMA(-m->y, at->x, m->x * at->y);
 }
 
 // sums: of the samples. dL_dln: sum dL/dd d, which only Gaussians need.
@@ -42,7 +42,7 @@ static inline Offsets derivatives_end(
     const bool grows = p->size < 0.0f;
     const float outward = grows ? sums[0] / (p->c.w * p->c.w) : 0.0f;
     const float3 away = (float3)(sums[1], sums[2], sums[3]) / fabs(p->size);
-    const float3 dL_dc = p->opacity * (outward * p->c.xyz - away);
+    const float3 dL_dc = -p->opacity * (away - outward * p->c.xyz);
     const float3 world = dL_dc.x * cam->right + dL_dc.y * cam->down + dL_dc.z * cam->forward;
     return (Offsets)(voxel_size * world, grows ? 0.0f : p->opacity * sums[0]);
 }
