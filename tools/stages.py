@@ -35,8 +35,8 @@ WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features
 def least_bytes(n: int, visible: int, pairs: int, shown: int, pixels: int, sh: int) -> dict:
     """{stage: bytes that it must read or write once}.
 
-    n: points. visible: those that show in a sample. pairs: of a point and a tile. shown: those where
-    the point shows. sh: bytes of a point's SH coefficients.
+    n: points. visible: those that show in a sample. pairs: of a point and a tile. shown: those
+    where the point shows. sh: bytes of a point's SH coefficients.
     """
     cloud = 5 * WORD  # id and offset
     record = 8 * WORD
@@ -49,7 +49,7 @@ def least_bytes(n: int, visible: int, pairs: int, shown: int, pixels: int, sh: i
         "shade": visible * (sh + ROW),
         "blend": shown * key + visible * (record + ROW) + pixels * ROW,
         "backward": shown * (key + 2 * (ROW + record))
-        + visible * (2 * ROW + 2 * record)
+        + visible * 2 * (ROW + record)
         + pixels * ROW,
         "update": visible * (2 * sh + 3 * ROW + 2 * WORD + 5 * moved),
     }

@@ -18,12 +18,7 @@
 // G.f + g. The distortion loss of a sample, w sum_ij b_i b_j |z_i - z_j| (Mip-NeRF 360, Eq. 15), adds
 // its derivative with respect to b_i to G.f_i in the same way, and so does the depth loss
 // (training/depth_loss.cl).
-#include "raster/compositing.h"
-
-#ifndef MOVED
-#define MOVED MOVES  // 1: gradients of offsets, too
-#endif
-#include "raster/sums.h"
+#include "raster/gradients.h"
 
 // GROUP work-items per tile: read the points that show, nearest first, and their features, write
 // those of the tile's pixels.
@@ -86,179 +81,6 @@ kernel void blend_forward(
                     sums[own * OWN_PIXELS + OF_PIXEL(k)] / SAMPLES + transmittance[q] * BACKGROUND;
         }
     }
-}
-
-// The gradients of a tile's pixels, of each sample's share: those of features, and the loss's
-// derivatives by alpha and, with its mean range, by range.
-#if GROUP > 1
-#define ROWS (GROUP / 16)  // of work-items that first add up by 16
-
-typedef struct {
-    float16 of_features[OWN_BLOCKS];  // of a work-item's pixel
-    float of_alpha[OWN_BLOCKS], of_range[OWN_BLOCKS], mean[OWN_BLOCKS];
-    float of_channel[OWN_BLOCKS][16];  // of the 16 pixels that it adds up, one channel
-} PixelGradients;
-
-#define SHARED_SUMS                                                                                \
-    local float shared_weight[OWN_BLOCKS * GROUP], shared_sums[SUMS * GROUP];                      \
-    local float shared_rows[ROWS * (CHANNELS + SUMS)];
-
-#define FEATURE_ROW const float16 f = FEATURES(entry);
-#define ADD_PIXELS_OF_POINT
-#define OF_POINT(own)                                                                              \
-    (dot16(g.of_features[own], f) + g.of_alpha[own] + g.of_range[own] * (range - g.mean[own]))
-#define ADD_WEIGHTS(own, b) shared_weight[GROUP * own + MEMBER] = SUM_LANES(b);
-
-// Adds up the weights and sums of all pixels, in a fixed order: first 16 by 16, then these.
-#define SUM_PAIR                                                                                   \
-    for (uint s = 0; s < SUMS; s++)                                                                \
-        shared_sums[GROUP * s + MEMBER] = SUM_LANES(sums[s]);                                      \
-    barrier(CLK_LOCAL_MEM_FENCE);                                                                  \
-    float of_row = 0.0f;                                                                           \
-    UNROLLED_FOR (uint own = 0; own < OWN_BLOCKS; own++)                                           \
-        for (uint i = 0; i < 16; i++) {                                                            \
-            const uint pixel = GROUP * own + MEMBER / 16 * 16 + i;                                 \
-            if (blocks >> pixel / BLOCK_PIXELS & 1)                                                \
-                of_row += shared_weight[pixel] * g.of_channel[own][i];                             \
-        }                                                                                          \
-    shared_rows[MEMBER] = of_row;                                                                  \
-    for (uint i = MEMBER; i < ROWS * SUMS; i += GROUP) {                                           \
-        float sum = 0.0f;                                                                          \
-        for (uint item = 16 * i; item < 16 * i + 16; item++)                                       \
-            sum += shared_sums[item];                                                              \
-        shared_rows[ROWS * CHANNELS + i] = sum;                                                    \
-    }                                                                                              \
-    barrier(CLK_LOCAL_MEM_FENCE);                                                                  \
-    for (uint i = MEMBER; blocks && i < CHANNELS + SUMS; i += GROUP) {                             \
-        const uint from = i < CHANNELS ? i : ROWS * i, step = i < CHANNELS ? CHANNELS : 1;         \
-        float sum = 0.0f;                                                                          \
-        for (uint row = 0; row < ROWS; row++)                                                      \
-            sum += shared_rows[from + step * row];                                                 \
-        if (i < CHANNELS)                                                                          \
-            ((global float *)row_of_features)[i] = sum;                                            \
-        else                                                                                       \
-            pair_sums[SUMS * (size_t)pair + i - CHANNELS] = sum;                                   \
-        if (i == 0) pair_shows[pair] = 1;                                                          \
-    }
-#else
-#define BLOCKS_TOGETHER SAMPLES  // have 16 pixels
-#define PARTS (BLOCKS / BLOCKS_TOGETHER)
-
-typedef struct {
-    float16 of_features[BLOCKS * BLOCK_PIXELS];
-    float16 of_channel[CHANNELS * PARTS];  // the same: 16 pixels by channel
-    float16 of_alpha[PARTS], of_range[PARTS], mean[PARTS];
-} PixelGradients;
-
-#define SHARED_SUMS
-#define FEATURE_ROW                                                                                \
-    global const float *row = (global const float *)(visible_features + point_slot[(uint)entry]);
-
-// G.f of 16 pixels at a time, of those parts of the tile that have any of the blocks.
-#define ADD_PIXELS_OF_POINT                                                                        \
-    float of_pixels[BLOCKS * BLOCK_PIXELS];                                                        \
-    float16 of_point = 0.0f, of_others = 0.0f;                                                     \
-    for (uint left = blocks; left;) {                                                              \
-        const uint part = (31 - clz(left & -left)) / BLOCKS_TOGETHER;                              \
-        left &= ~(((1u << BLOCKS_TOGETHER) - 1) << part * BLOCKS_TOGETHER);                        \
-        float16 one = g.of_alpha[part] + g.of_range[part] * (range - g.mean[part]), other = 0.0f;  \
-        UNROLLED_FOR (uint c = 0; c < CHANNELS; c += 2) {                                          \
-            one += row[c] * g.of_channel[CHANNELS * part + c];                                     \
-            other += row[c + 1] * g.of_channel[CHANNELS * part + c + 1];                           \
-        }                                                                                          \
-        vstore16(one + other, part, of_pixels);                                                    \
-    }
-#define OF_POINT(own) of_samples(of_pixels + BLOCK_PIXELS * own)
-#define ADD_WEIGHTS(own, b)                                                                        \
-    {                                                                                              \
-        float w[BLOCK_PIXELS];                                                                     \
-        sum_pixels(b, w);                                                                          \
-        const float16 *G = g.of_features + BLOCK_PIXELS * own;                                     \
-        UNROLLED_FOR (uint k = 0; k < BLOCK_PIXELS; k += 4) {                                      \
-            of_point += w[k] * G[k] + w[k + 1] * G[k + 1];                                         \
-            of_others += w[k + 2] * G[k + 2] + w[k + 3] * G[k + 3];                                \
-        }                                                                                          \
-    }
-#define SUM_PAIR                                                                                   \
-    *row_of_features = of_point + of_others;                                                       \
-    STORE_SUMS(sum_of_each(sums), pair, pair_sums);                                                \
-    pair_shows[pair] = 1;
-
-// Values of the pixels of a block, for each sample.
-ALWAYS_INLINE float16 of_samples(const float *of_pixels) {
-#if SAMPLES == 4
-    const float4 once = vload4(0, of_pixels);
-    return (float16)(once, once, once, once);
-#else
-    return vload16(0, of_pixels);
-#endif
-}
-
-// The sums of SUMS vectors.
-ALWAYS_INLINE Sums sum_of_each(const float16 v[SUMS]) {
-#if !MOVED
-    return (Sums)(sum16(v[0]), sum16(v[1]));
-#else
-    float16 halves[4];
-    for (int i = 0; i < 4; i++)
-        halves[i] =
-            (float16)(v[2 * i].lo, v[2 * i + 1].lo) + (float16)(v[2 * i].hi, v[2 * i + 1].hi);
-    float16 quarters[2];  // of 0, 2, 1, 3 and 4, 6, 5, 7
-    for (int i = 0; i < 2; i++) {
-        const float16 a = halves[2 * i], b = halves[2 * i + 1];
-        quarters[i] = (float16)(a.lo.lo, b.lo.lo, a.hi.lo, b.hi.lo) +
-                      (float16)(a.lo.hi, b.lo.hi, a.hi.hi, b.hi.hi);
-    }
-    const float16 a = quarters[0], b = quarters[1];
-    const float16 twos = (float16)(a.s01, b.s01, a.s45, b.s45, a.s89, b.s89, a.scd, b.scd) +
-                         (float16)(a.s23, b.s23, a.s67, b.s67, a.sab, b.sab, a.sef, b.sef);
-    const float8 sums = twos.even + twos.odd;  // of 0, 4, 2, 6, 1, 5, 3, 7
-    return (float8)(sums.s0, sums.s4, sums.s2, sums.s6, sums.s1, sums.s5, sums.s3, sums.s7);
-#endif
-}
-#endif
-
-// What a tile's samples begin with on the way back: the gradients of their pixels, and G times what
-// shows in place of a fragment, for alpha compositing the background.
-ALWAYS_INLINE void gradients_load(
-    const Tile *tile,
-    global const float16 *features,
-    global const float16 *grad_features,
-    global const float *grad_alpha,
-    global const float2 *depth_gradient,
-    PixelGradients *g,
-    floats behind[OWN_BLOCKS]) {
-    for (uint own = 0; own < OWN_BLOCKS; own++) {
-        float of_pixel[OWN_PIXELS];
-        FOR_PIXELS(k) {
-            const uint q = pixel_of(tile, own, k), at = own * OWN_PIXELS + OF_PIXEL(k);
-            const bool is_there = q != NONE;
-            const float16 G = is_there ? grad_features[q] / SAMPLES : 0.0f;
-            const float2 depth = is_there && depth_gradient ? depth_gradient[q] : 0.0f;
-            g->of_features[at] = G;
-            ((float *)g->of_alpha)[at] = is_there && grad_alpha ? grad_alpha[q] / SAMPLES : 0.0f;
-            ((float *)g->of_range)[at] = depth.x / SAMPLES;
-            ((float *)g->mean)[at] = depth.y;
-            of_pixel[OF_PIXEL(k)] = dot16(G, SOFTMAX && is_there ? features[q] : BACKGROUND);
-        }
-#if GROUP > 1
-        behind[own] = of_pixel[0];
-        for (int i = 0; i < 16; i++) {
-            const uint pixel = GROUP * own + MEMBER / 16 * 16 + i;
-            const uint q = pixel_in(tile, pixel / BLOCK_PIXELS, pixel % BLOCK_PIXELS);
-            global const float *G = (global const float *)grad_features + CHANNELS * (size_t)q;
-            g->of_channel[own][i] = q == NONE ? 0.0f : G[MEMBER % 16] / SAMPLES;
-        }
-#else
-        behind[own] = of_samples(of_pixel);
-#endif
-    }
-#if GROUP == 1
-    for (uint pixel = 0; pixel < BLOCKS * BLOCK_PIXELS; pixel++)
-        for (uint c = 0; c < CHANNELS; c++)
-            ((float *)g->of_channel)[16 * (pixel / 16 * CHANNELS + c) + pixel % 16] =
-                ((const float *)g->of_features)[CHANNELS * pixel + c];
-#endif
 }
 
 // GROUP work-items per tile: read the points that show, farthest first, and write by pair what the
@@ -333,18 +155,14 @@ kernel void blend_backward(
             const uint blocks = (uint)(entry >> 32);
             const uint pair = pair_of(&point, &tile, point_offset[(uint)entry]);
             const float range = DEPTH(&point), z = range - nearest;
-            global float16 *row_of_features = IS_IN_ONE_TILE(point)
-                                                  ? grad_visible_features + point_slot[(uint)entry]
-                                                  : pair_features + pair;
-            FEATURE_ROW
             floats sums[SUMS];
             UNROLLED_FOR (uint s = 0; s < SUMS; s++)
                 sums[s] = 0.0f;
-            ADD_PIXELS_OF_POINT;
+            PairGradients of_pair = PAIR_BEGIN(&g, FEATURE_ROW(entry), blocks, range);
             FOR_BLOCKS(own, blocks) {
                 Sample *s = samples + own;
                 const Coverage at = coverage_at(rays + own, &point);
-                floats dL_db = OF_POINT(own) - behind[own];
+                floats dL_db = of_samples(&of_pair, &g, own) - behind[own];
 #if SOFTMAX
                 ints shows;
                 const floats share = share_of(s, &rule, &point, &at, rank, &shows);
@@ -380,9 +198,13 @@ kernel void blend_backward(
 #endif
 #endif
                 sums[0] += b;
-                ADD_WEIGHTS(own, b)
+                add_weights(&of_pair, &g, own, b);
             }
-            SUM_PAIR
+            global float16 *features_row = IS_IN_ONE_TILE(point)
+                                               ? grad_visible_features + point_slot[(uint)entry]
+                                               : pair_features + pair;
+            store_pair(&of_pair, &g, sums, features_row, pair_sums + SUMS * (size_t)pair);
+            if (MEMBER == 0 && blocks) pair_shows[pair] = 1;
         }
     }
     if (distortion_weight > 0.0f) {

@@ -16,13 +16,13 @@
 #include "raster/footprint.h"
 #include "reduce.h"
 
-#define BLOCKS 16              // of a tile
-#define BLOCK_SIDE (4 / SIDE)  // pixels
-#define BLOCK_PIXELS                                                                               \
-    (16 / SAMPLES)  // of a block; sample s of pixel k is in lane BLOCK_PIXELS s + k
+#define BLOCKS 16  // of a tile
 #define TILE_SAMPLES (16 * BLOCKS)
-#define COVERED                                                                                    \
-    (4 / SIDE)  // along a tile: parts of 4 x 4 pixels, the network's tiles (layers/tiles.h)
+#define BLOCK_SIDE (4 / SIDE)  // pixels
+// Pixels of a block; sample s of pixel k is in lane BLOCK_PIXELS s + k.
+#define BLOCK_PIXELS (16 / SAMPLES)
+// Parts of 4 x 4 pixels, which are the network's tiles (layers/tiles.h), along a tile.
+#define COVERED (4 / SIDE)
 
 // The first pixel of a block in its tile. In their Z-order, four neighbours follow one another.
 #define BLOCK_X(b) (BLOCK_SIDE * (int)(((b) & 1) | ((b) >> 1 & 2)))

@@ -31,14 +31,14 @@ FLIPS = [
     ("raster/footprint/gaussian.h", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
     ("raster/project", "seen += basis[k]", "seen -= basis[k]", "raster: opacities by direction"),
     ("raster/pairs", "as_uint(DEPTH", "as_uint(-DEPTH", "raster: pairs, soft"),
-    ("raster/pairs", "sum = add_sat(sum, own)", "sum = sub_sat(sum, own)", "raster: pairs, soft"),
     ("raster/pairs", "shift < bits", "shift > bits", "raster: thousands of equal depths"),
     ("raster/lists_by_key", "[middle] < k", "[middle] > k", "raster: thousands of equal depths"),
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
     ("raster/depth", "depth[own] += b", "depth[own] -= b", "raster: depth, softmax"),
     ("raster/depth", "+ share * (z", "- share * (z", "raster: depth, alpha"),
     ("raster/depth", "nearest + voxel", "nearest - voxel", "raster: depth of samples"),
-    ("raster/highest_weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
+    ("raster/highest_weights", "of_pair += w", "of_pair -= w", "raster: highest weights, alpha"),
+    ("raster/gather", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
     ("raster/compositing.h", ", M), 0.0f", ", -M), 0.0f", "softmax: forward, disc"),
     ("raster/compositing.h", "= 1.0f - alpha", "= 1.0f + alpha", "alpha: forward, soft"),
     ("raster/weights", "(k)] / SAMPLES;\n", "(k)] * SAMPLES;\n", "alpha: samples of a pixel"),
@@ -47,13 +47,13 @@ FLIPS = [
     ("raster/softmax", "[own]) <= tracked", "[own]) >= tracked", "softmax: backward, soft"),
     ("raster/blend", " + transmittance[q]", " - transmittance[q]", "softmax: forward, soft"),
     ("raster/blend", "(1.0f + a) * dL_db", "(1.0f - a) * dL_db", "softmax: backward, soft"),
-    ("raster/blend", "OF_POINT(own) - behind", "OF_POINT(own) + behind", "alpha: backward, disc"),
+    ("raster/blend", "&g, own) - behind", "&g, own) + behind", "alpha: backward, disc"),
     ("raster/blend", "after * inverse(", "after / inverse(", "alpha: backward, soft"),
-    ("raster/blend", "one = g.of_alpha", "one = -g.of_alpha", "alpha: gradient of alpha"),
+    ("raster/gradients.h", "one = g->of_alpha", "one = -g->of_alpha", "alpha: gradient of alpha"),
     ("raster/blend", "before - after", "before + after", "alpha: samples of a pixel"),
     ("raster/blend", "before - after", "before + after", "alpha: distortion loss"),
     ("raster/blend", "loss += b * dist", "loss -= b * dist", "alpha: distortion loss"),
-    ("raster/blend", "(range - g.mean[part])", "(range + g.mean[part])", "alpha: depth loss"),
+    ("raster/gradients.h", "(range - g->mean", "(range + g->mean", "alpha: depth loss"),
     ("raster/gather", "dL_df += load", "dL_df -= load", "alpha: backward, soft"),
     ("raster/fragments", "= weight[", "= -weight[", "alpha: forward, soft"),
     ("training/depth_loss", "here - after", "here + after", "alpha: depth loss"),
@@ -96,7 +96,8 @@ FLIPS = [
 ]  # fmt: skip
 # here the replacement is a naive formula, which a hard case must detect
 NAIVE = [
-    ("raster/footprint/soft.h", "select(u, most, u > most)", "u", "alpha: a point on the ray"),
+    ("raster/footprint/round.h", "FMA(at.z, at.z, 1e-30f)", "at.z * at.z",
+     "alpha: a point on the ray"),
     ("raster/compositing.h", "select(through, (floats)(LEAST_THROUGH), through < LEAST_THROUGH)",
      "through", "alpha: an opaque fragment"),
     ("raster/footprint/gaussian.h", "sqrt(wide + v * (xx + yy) + v * v)",
@@ -158,7 +159,9 @@ def acts_as_cpu(dev, file, text):
     if file == "raster/lists_by_key":
         return False
     return (
-        dev.is_cpu or file in ("raster/pairs", "raster/blend") or file.startswith("layers/winograd")
+        dev.is_cpu
+        or file in ("raster/pairs", "raster/gradients.h")
+        or file.startswith("layers/winograd")
     )
 
 

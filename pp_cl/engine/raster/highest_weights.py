@@ -1,5 +1,7 @@
 """Records each point's highest blend weight in an image, by which it is pruned."""
 
+from typing import Any
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -32,7 +34,7 @@ def record_weights(
     """
     b.require(recording_table(pairs.capacity))
     dev.fill(b.pair_weight, 0)
-    of_pairs = {"point_offset": pairs.point_offset, "pair_weight": b.pair_weight}
+    of_pairs: dict[str, Any] = {"point_offset": pairs.point_offset, "pair_weight": b.pair_weight}
     name = "raster/highest_weights"
     launch_tiles(dev, name, "pair_weights", points, pairs, **of_pairs, **weights.walk())
     n = len(weights.point_is_visible)
