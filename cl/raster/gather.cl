@@ -15,7 +15,7 @@
 kernel void gather_pairs(
     const uint s,                            // visible points
     const int is_recorded,                   // 0: max_weight is not touched
-    const float voxel_size,                  // of the grid, world units; 0: no gradients of offsets
+    const float voxel_size,                  // of the grid, world units; read with MOVED
     const float radius,                      // of a point without offsets, world units
     global const uint *visible,              // (?) their indices, S
     global const float *camera,              // (21) camera.h, of the samples
@@ -51,13 +51,11 @@ kernel void gather_pairs(
     STORE_SUMS(all, 0, sums);
     grad_opacity[g] = sums[1];
 #if MOVED
-    if (voxel_size > 0.0f) {
-        const Camera cam = camera_load(camera);
-        const Point point = POINT_OF(point_record, i);
-        const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
-        OFFSETS_AT(grad_offset, g) = derivatives_end(
-            sums + 2, point.opacity * sums[1], &cam, &point, voxel_size, radius, offset);
-    }
+    const Camera cam = camera_load(camera);
+    const Point point = POINT_OF(point_record, i);
+    const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
+    OFFSETS_AT(grad_offset, g) = derivatives_end(
+        sums + 2, point.opacity * sums[1], &cam, &point, voxel_size, radius, offset);
 #endif
     const float weight = sums[0] / SAMPLES;
     // fmax() would hide a NaN

@@ -160,6 +160,7 @@ def _places_by(kind, scene, dL_dd, radius, unit):
     """(N, 3) gradients of places in a precision, with a ray's vector to a centre as c - (c.r) r."""
     camera = scene.camera
     c = scene.projected.point_record.get()[:, :3].view(np.float32).astype(kind)
+    c[scene.projected.point_count.get() == 0] = 1  # undefined
     r = dense.rays(camera).astype(kind)
     away = c[:, None] - (c @ r.T)[..., None] * r[None]
     rho = np.linalg.norm(away, axis=2)

@@ -33,11 +33,6 @@ class Fragments:
         """The pixel of each fragment."""
         return np.repeat(np.arange(len(self.offset) - 1), np.diff(self.offset))
 
-    @property
-    def rank(self) -> np.ndarray:
-        """The number of nearer fragments of the same pixel."""
-        return np.arange(len(self.point)) - self.offset[self.pixel]
-
 
 def count_fragments(
     dev: Device, points: ProjectedPoints, pairs: Pairs, weights: BlendWeights

@@ -19,6 +19,7 @@ from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 MOST_CHUNKS = 64  # most chunks of the points; CPUs list them in parallel
+MOST_COUNTS = 2**22  # numbers of pairs by chunk and tile
 RUN = 64  # keys that GPUs rank by comparing all with all; runs of this length are merged
 LONG_LIST = RUN * RUN  # GPUs merge lists of more keys than this in several passes
 TILE_SAMPLES = 256  # GPUs walk along a tile with a work-item for each of its pixels
@@ -76,7 +77,7 @@ def pairs_table(
     rows, columns = tiles_of(size, side)
     tiles = rows * columns
     table: Table = {
-        "tile_next": ((_chunks(dev) if dev.is_cpu else 1, tiles), np.uint32),
+        "tile_next": ((_chunks(dev, tiles) if dev.is_cpu else 1, tiles), np.uint32),
         "tile_size": ((tiles,), np.uint32),
         "tile_offset": ((tiles + 1,), np.uint32),
         "pair_key": ((pairs,), np.uint64),
@@ -90,8 +91,8 @@ def pairs_table(
     return table
 
 
-def _chunks(dev):
-    return min(MOST_CHUNKS, 2 * dev.info["compute_units"])
+def _chunks(dev, tiles):
+    return max(1, min(MOST_CHUNKS, 2 * dev.info["compute_units"], MOST_COUNTS // tiles))
 
 
 @replayed
@@ -114,7 +115,8 @@ def find_pairs(
     b.require(pairs_table(dev, n, size, capacity, points.side, by_point))
     macros = {"LANES": lanes(dev), "BLOCK": BLOCK, **points.macros()}
     program = dev.program("raster/pairs", **macros)
-    chunks, count = (_chunks(dev) if dev.is_cpu else n), tiles[0] * tiles[1]
+    count = tiles[0] * tiles[1]
+    chunks = len(b.tile_next) if dev.is_cpu else n
     of_points: dict[str, Any] = {
         "n": n,
         "chunks": chunks,
