@@ -33,7 +33,7 @@ HIGHER_SH = 0.1
 
 class Scene:
     """Discs of the paper's radius, and the stages that render them. positions: (N, 3). opacity:
-    (N,). features: (N, 16) float32, SH coefficients of degree 0; those above are HIGHER_SH.
+    (N,). sh_0: (N, 1, 16) float32, SH coefficients of degree 0; those above are HIGHER_SH.
     """
 
     depth_range: tuple[float, float]

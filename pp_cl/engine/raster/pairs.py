@@ -22,7 +22,7 @@ MOST_CHUNKS = 64  # most chunks of the points; CPUs list them in parallel
 MOST_COUNTS = 2**22  # numbers of pairs by chunk and tile
 RUN = 64  # keys that GPUs rank by comparing all with all; runs of this length are merged
 LONG_LIST = RUN * RUN  # GPUs merge lists of more keys than this in several passes
-TILE_SAMPLES = 256  # GPUs walk along a tile with a work-item for each of its pixels
+TILE_SAMPLES = 256  # samples of a tile, 16 x 16; GPUs walk with a work-item for each
 
 
 @dataclass

@@ -14,6 +14,7 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import replayed
 from pp_cl.engine.device.scan import nonzero, read_total
+from pp_cl.engine.layers.tiles import grid_shape
 from pp_cl.engine.raster.pairs import TILE_SAMPLES, Pairs, launch_tiles
 from pp_cl.engine.raster.project import ProjectedPoints, tiles_of
 
@@ -21,7 +22,6 @@ BLENDS = ("softmax", "alpha")
 ALL = 2**32 - 1  # max_tracked if all fragments get gradients
 # The least early_stop of alpha compositing: the way back divides by what a sample has let through.
 LEAST_STOP = 1e-20
-PART = 4  # pixels along a part of the image of which is known whether it shows anything
 
 
 @dataclass
@@ -107,7 +107,7 @@ def weights_table(
         "tile_shown": ((rows * columns,), np.uint32),
         "transmittance": ((pixels,), np.float32),
         "mean_range": ((pixels,), np.float32),
-        "is_covered": ((-(-size[0] // PART), -(-size[1] // PART)), np.int32),
+        "is_covered": (grid_shape(*size), np.int32),
         "point_is_visible": ((n,), np.uint8),
         "visible": ((n,), np.uint32),
         "point_slot": ((n,), np.uint32),
