@@ -32,7 +32,9 @@ REQUIRED |= dict.fromkeys(("views", "depth_range"), (list,))
 REQUIRED |= {"finished": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
 OPTIONAL: dict[str, tuple] = {"extended_from": (int,), "left_out": (list,), "notes": (list,)}
 OPTIONAL |= {"specular": (bool,), "averaged": (bool,)}
+OPTIONAL |= dict.fromkeys(("progress", "seconds", "passed"), (int, float))
 OPTIONAL |= {"exposed": (str, bool)}  # true in runs of 0.3.0
+MOST_SECONDS = 10**9  # of a training
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
 Arrays = Mapping[str, np.ndarray | DeviceRows]
@@ -164,6 +166,11 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
         yield stored
 
 
+def progress_of(header: dict[str, Any], iterations: int) -> float:
+    """The progress, from 0 to 1, of a training of so many iterations at its checkpoint."""
+    return 1.0 if header["finished"] else header.get("progress", header["step"] / iterations)
+
+
 def load_run_state(
     folder: RunFolder, config: Config
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -205,6 +212,9 @@ def _problem_of_header(header, steps):
             and grid.id_count <= MOST_IDS
             and 0 < header["initial_points"] <= MOST_IDS
             and 0 <= header.get("extended_from", 0) <= header["step"]
+            and 0 <= header.get("progress", 0) <= 1
+            and 0 <= header.get("seconds", 0) <= MOST_SECONDS
+            and 0 <= header.get("passed", 0) <= MOST_SECONDS
             and set(header.get("left_out", [])) < {view.name for view in views}
         )
     except (KeyError, TypeError, ValueError, OverflowError):

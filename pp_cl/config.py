@@ -339,9 +339,6 @@ def _resumed(folder, stored, scene, given):
     config, free = configure(load_config(folder.config), scene, given), {*FREE}
     if not is_supersampled(config.raster):  # the setting has no effect, and the run has stored 0
         config.train.supersampled = stored.train.supersampled
-    if stored.train.minutes:  # the run has planned these, as it did train.iterations
-        config.train.refine_at = stored.train.refine_at
-        config.train.supersampled = stored.train.supersampled
     if config.train.iterations != stored.train.iterations:
         with opened_run(folder, stored) as run:
             if run.header["finished"]:

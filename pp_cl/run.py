@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.checkpoint import load_run_state
+from pp_cl.checkpoint import load_run_state, progress_of
 from pp_cl.config import configure, load_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
@@ -59,7 +59,7 @@ class Run:
     def renderer(self) -> Renderer:
         """A renderer of the model, whose parameters must no longer change."""
         self.model.net.freeze()
-        supersampling = supersampling_at(self._last_step, self.config.train)
+        supersampling = supersampling_at(self.progress, self.config.train)
         return Renderer(self.dev, self.model, self.config.raster, supersampling, MARGIN)
 
     def varied(
@@ -101,21 +101,35 @@ class Run:
         return run
 
     @property
-    def _last_step(self):
-        # while a finished run is extended, its settings have the future length, its header the step
-        return self.config.train.iterations if self.header["finished"] else self.header["step"]
+    def progress(self) -> float:
+        """The progress of the training, from 0 to 1."""
+        return progress_of(self.header, self.config.train.iterations)
 
     @property
     def gamma(self) -> float:
         """The depth sharpness of the blend at the run's last step."""
-        return gamma_at(self._last_step, self.config.train.iterations)
+        return gamma_at(self.progress)
 
-    def scene(self, split: str) -> Scene:
+    def scene(self, split: str, side: int = 0) -> Scene:
         """The run's scene with one split, without views that training has left out or that show
-        another place. Raises UserError if it is missing, broken or not the run's scene.
+        another place. side: pixels of its views' longer side; 0: as in the training. Raises
+        UserError if it is missing, broken or not the run's scene, or if images are smaller.
         """
         check_scene(self.config.scene.path)
-        scene = open_scene(self.dev, self.config, (split,))
+        config = self.config
+        if side:
+            listed = list_split(config.scene.path, split, edited=False).image_files
+            longest = [max(file.camera.width, file.camera.height) for file in listed]
+            if min(longest) < side:
+                raise UserError(
+                    f"--size {side}: {listed[longest.index(min(longest))].name} has"
+                    f" {min(longest)} pixels; choose a size up to {min(longest)}"
+                )
+            config = replace(config, scene=replace(config.scene, downscale=min(longest) // side))
+        scene = open_scene(self.dev, config, (split,))
+        if side:
+            views = [view.of_size(side) for view in scene.splits[split]]
+            scene = replace(scene, splits={split: views})
 
         def trained():
             if "train" in scene.splits or not self.header["pixels"]:

@@ -124,8 +124,8 @@ class TrainConfig:
     )
     minutes: float = setting(
         0.0,
-        "minutes of the training with all that comes before and after its steps, whose number"
-        " follows from the measured speed, within 15 % (0: as many steps as set)",
+        "minutes of the training with all that comes before and after its steps; schedules follow"
+        " the time that has passed (0: as many steps as set)",
         0,
         1440,
     )

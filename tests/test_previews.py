@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 from support.refused import failure
@@ -26,7 +27,9 @@ def test_previews_and_measured_views_leave_the_run_as_it_is(tmp_path, monkeypatc
         assert main([*arguments(scene, out, train__prune_weight=0), *more]) == 0
     names = [[p.name for p in sorted((run / "previews").iterdir())] for run in (none, many)]
     assert names[0] == ["step_000060.png"]
-    assert names[1] == [f"step_{step:06d}.png" for step in (1, *range(9, 60, 9), 60)]
+    assert names[1] == [
+        f"step_{step:06d}.png" for step in (1, *(math.ceil(60 * n / 7) for n in range(1, 8)))
+    ]
     assert checkpoint(none) == checkpoint(many)
     log = rows(many)
     tests = {row["step"]: row["test_psnr"] for row in log if "test_psnr" in row}

@@ -44,9 +44,10 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     model = Model(dev, hull.grid, near_far, cloud, net=net)
     trainer = Trainer(dev, config, model, views)
     trainer.step = max(0, config.train.iterations - 1 - 2 * STEPS)
+    trainer.progress = trainer.step / config.train.iterations
     if trainer.exposure and not trainer.exposure.is_applied:
         trainer.exposure = None  # whether to apply it is decided by then
-    trainer.follow(config)
+    trainer.renew_crops()
     trainer.train_step()
     host = host_cost(trainer, STEPS)
     with dev.timed_stages() as seconds:

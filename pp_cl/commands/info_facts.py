@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.checkpoint import opened_run
+from pp_cl.checkpoint import opened_run, progress_of
 from pp_cl.config import Given, scene_config
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.layers import multiplications, unet_layers
 from pp_cl.engine.raster.weights import ALL
-from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.engine.training.schedule import refinements
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
@@ -77,7 +77,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     points = [form for name, form in forms.items() if name.startswith("points.")]
     of_point = sum(math.prod(form.shape[1:]) * form.dtype.itemsize for form in points)
     whole, size = math.prod(grid["dims"]), folder.checkpoint.stat().st_size
-    refined = sum(at <= header["step"] for at in refine_steps(config.train))
+    progress = progress_of(header, config.train.iterations)
+    refined = sum(at <= progress for at in refinements(config.train))
     if "extended_from" in header:  # all refinements came before
         refined = sum(0 < share < 1 for share in config.train.refine_at)
     cameras = [image_file.camera.downscaled(config.scene.downscale) for image_file in image_files]

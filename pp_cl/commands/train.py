@@ -83,7 +83,7 @@ def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lamb
 def _train(folder, config, options, chosen, follow):
     """Train one run. chosen: whether the preset chose the images' size."""
     from pp_cl.drivers import device_line, open_device
-    from pp_cl.engine.training.schedule import refine_steps
+    from pp_cl.engine.training.schedule import refinements
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
 
@@ -108,7 +108,7 @@ def _train(folder, config, options, chosen, follow):
             " moments start again"
         )
     wanted = sum(0 < share < 1 for share in train.refine_at)
-    if training.hull and (made := len(refine_steps(train))) < wanted:
+    if training.hull and (made := len(refinements(train))) < wanted:
         print(
             f"refinements: {made} of the {wanted} of train.refine_at, since in"
             f" {train.iterations} iterations nothing is pruned between them"
@@ -219,7 +219,7 @@ def _run(training, options):
                 f"stopped at once; the same command {resumes} {folder.checkpoint}", 128 + number
             ) from None
     if caught:
-        is_finished = trainer.step == training.config.train.iterations
+        is_finished = trainer.progress >= 1
         goes_on = "the training is finished" if is_finished else "the same command goes on"
         raise Stopped(
             f"stopped at step {trainer.step}; wrote {folder.checkpoint}; {goes_on}",

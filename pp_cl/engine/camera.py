@@ -137,6 +137,19 @@ class Camera:
         fx, fy = scale * self.fx, scale * self.fy
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
+    def stretched(self, width: int, height: int) -> "Camera":
+        """The camera of the same image resampled to width x height pixels."""
+        across, down = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=across * self.fx,
+            fy=down * self.fy,
+            cx=across * self.cx,
+            cy=down * self.cy,
+            width=width,
+            height=height,
+        )
+
     def with_angle(self, radians: float) -> "Camera":
         """The camera with this angle of view across the width of its image."""
         scale = self.width / 2 / math.tan(radians / 2) / self.fx

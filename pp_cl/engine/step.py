@@ -4,6 +4,8 @@ update. training/between.py has the work between steps, session/training.py the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -22,7 +24,7 @@ from pp_cl.engine.training.schedule import (
     Rates,
     gamma_at,
     late_weight,
-    refine_steps,
+    refinements,
     rising_weight,
     supersampling_at,
 )
@@ -39,7 +41,11 @@ class Trainer:
     start at any step.
 
     step: number of steps done. begun: the step at which the optimiser's moments started; above 0 if
-    a finished training is extended. state: the training state of each point. crops: an
+    a finished training is extended. progress: of the steps done, as schedules take it. clock: tells
+    it after each step, from the number of steps; None: by iterations. steps: how many there will be
+    in all, for rates that depend on it. refine_at: the progresses at which the grid is refined,
+    ascending. make_room: called, if set, with the progress before a step after which more memory is
+    taken; it may follow() settings without that. state: the training state of each point. crops: an
     instance of the class given as `crops`, which draws them.
     """
 
@@ -70,16 +76,20 @@ class Trainer:
         self._buffers, self._depth_buffers = Buffers(dev), Buffers(dev)
         self._terms: Pending[dict[str, float]] | None = None  # of the last step's loss
         self.smoother: Smoother | None = None  # made when due, and again after points change
-        self.refine_steps = refine_steps(train)
+        self.progress = 0.0
+        self.clock: Callable[[int], float] | None = None
+        self.steps: float = train.iterations
+        self.make_room: Callable[[float], None] | None = None
+        self.refine_at = refinements(train)
         self._crops_class = crops
         self.renew_crops()
         self.fitted: Fitted | None = None  # set by finish()
 
     def follow(self, config: Config) -> None:
-        """Go on with settings that differ in iterations, refine_at, supersampled and radius."""
+        """Go on with settings that differ in refine_at, supersampled and radius."""
         self.config = config
         self.renderer.settings = config.raster
-        self.refine_steps = refine_steps(config.train)
+        self.refine_at = refinements(config.train)
         if self.refinements_to_come != self.crops.halvings:
             self.renew_crops()
 
@@ -90,7 +100,7 @@ class Trainer:
     @property
     def refinements_to_come(self) -> int:
         """How often the grid will still be refined; the images are halved as often."""
-        return sum(self.step < step for step in self.refine_steps)
+        return sum(self.progress < at for at in self.refine_at)
 
     @property
     def exposed(self) -> str:
@@ -100,7 +110,7 @@ class Trainer:
     @property
     def gamma(self) -> float:
         """Depth sharpness of the softmax after the steps done."""
-        return gamma_at(self.step, self.config.train.iterations)
+        return gamma_at(self.progress)
 
     # ---- a step ----------------------------------------------------------------------------------
 
@@ -108,8 +118,8 @@ class Trainer:
         """Enqueue one step, which the device may not have finished on return; returns the terms of
         its loss. Raises Diverged if a term of the previous step is not finite.
         """
-        config, train = self.config, self.config.train
-        rates = Rates.at(self.step, config.network, train)
+        train = self.config.train
+        rates = self.rates()
         crop = self.crops.draw(self.step)
         with self.dev.stage("target"):
             image, alpha = self.targets.crop(crop.view, crop.box, crop.jitter)
@@ -124,7 +134,7 @@ class Trainer:
             gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
-        self.renderer.supersampling = supersampling_at(self.step, train)
+        self.renderer.supersampling = supersampling_at(self.progress, train)
         rendered = self.renderer.forward(
             crop.camera,
             self.gamma,
@@ -137,7 +147,7 @@ class Trainer:
                 offset = rendered.offset
                 self.exposure.fit(crop.view_index, rendered.image, image, alpha, offset)
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
-            depth_weight = late_weight(self.step, train.iterations, train.depth_weight)
+            depth_weight = late_weight(self.progress, train.depth_weight)
             has_depth = self.composited and depth_weight > 0
             depth = self._depth_gradient(rendered, depth_weight) if has_depth else None
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
@@ -165,12 +175,14 @@ class Trainer:
                 sh_eps=train.sh_eps / target.size,
             )
         self.step += 1
+        before = self.progress
+        self.progress = self.clock(self.step) if self.clock else self.step / train.iterations
         self.check()
         distortion = gradients.distortion, distortion_weight, 1 / all_depths
         self._terms = self.loss.read(self.step, *distortion)
         # so that the renderer can release them
         del rendered, gradients
-        between.after_update(self, rates)
+        between.after_update(self, rates, before)
         return self._terms
 
     def _losses(
@@ -212,7 +224,7 @@ class Trainer:
 
     def _rising(self, weight):
         """A weight of the loss, scaled so that it rises from 0 during the training."""
-        return rising_weight(self.step, self.config.train.iterations, weight)
+        return rising_weight(self.progress, weight)
 
     def check(self) -> None:
         """Raise Diverged if a term of the loss of the last step is not finite."""
@@ -227,9 +239,9 @@ class Trainer:
 
     # ---- what the session shows and resumes ------------------------------------------------------
 
-    def rates(self) -> dict:
-        """The learning rates of the last step, for the log."""
-        return vars(Rates.at(max(self.step - 1, 0), self.config.network, self.config.train))
+    def rates(self) -> Rates:
+        """The learning rates of the next step."""
+        return Rates.at(self.progress, self.steps, self.config.network, self.config.train)
 
     def render(self, view: View) -> np.ndarray:
         """(H, W, 3) float32 in [0, 1]: the current model's image of a view."""
@@ -239,7 +251,9 @@ class Trainer:
         """(H, W, 3) float32 in [0, 1]: the image that render(view) should match."""
         return self.targets.whole(view)
 
-    def start_at(self, step: int, begun: int) -> None:
-        """Go on as after `step` steps; the optimiser's moments started at the step `begun`."""
-        self.step, self.begun = step, begun
+    def start_at(self, step: int, begun: int, progress: float) -> None:
+        """Go on after `step` steps at this progress; the optimiser's moments started at the step
+        `begun`.
+        """
+        self.step, self.begun, self.progress = step, begun, progress
         self.renew_crops()

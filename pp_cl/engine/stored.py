@@ -26,7 +26,7 @@ from pp_cl.engine.raster.points import (
 from pp_cl.engine.step import Trainer
 from pp_cl.engine.training.exposure import MATRIX
 from pp_cl.engine.training.optim import Optimiser
-from pp_cl.engine.training.schedule import ema_start
+from pp_cl.engine.training.schedule import EMA_FROM
 from pp_cl.engine.training.state import PointState
 from pp_cl.settings import Config
 
@@ -57,7 +57,7 @@ def stored_table(
     if step is not None:
         table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
         state = PointState.table(n)
-        is_due = config.train.ema and step >= ema_start(config.train.iterations)
+        is_due = config.train.ema and step >= EMA_FROM * config.train.iterations
         if is_due if averaged is None else averaged:
             state |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
             table |= {f"average.{name}": row for name, row in network.items()}
@@ -149,13 +149,20 @@ def training_arrays(trainer: Trainer) -> dict[str, DeviceRows]:
 
 
 def restore_training(
-    trainer: Trainer, step: int, arrays: dict[str, np.ndarray], begun: int, exposed: str = ""
+    trainer: Trainer,
+    step: int,
+    arrays: dict[str, np.ndarray],
+    begun: int,
+    exposed: str = "",
+    progress: float = 0.0,
 ) -> None:
     """Resume after `step` steps with a checkpoint's training state, which is removed from `arrays`;
     the model must be loaded already. A finished training stores no such state: its moments start
     anew, and so do its EMA, if it is due, and the estimates of colours. exposed: Exposure.kind.
+    progress:
+    after these steps.
     """
-    trainer.start_at(step, begun)
+    trainer.start_at(step, begun, progress)
     train = trainer.config.train
     if arrays:
         restore_optimiser(trainer.optimiser, arrays)
@@ -166,7 +173,7 @@ def restore_training(
         return
     if trainer.exposure:
         trainer.exposure.restore(exposed)
-    if train.ema and step >= ema_start(train.iterations):
+    if train.ema and trainer.progress >= EMA_FROM:
         trainer.optimiser.update_ema(1.0)
 
 

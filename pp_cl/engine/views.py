@@ -120,6 +120,37 @@ class View:
         size = self.stored_camera.width, self.stored_camera.height
         return replace(self, downscale=fitting_downscale(size, side))
 
+    def of_size(self, side: int) -> "View":
+        """The image with a longer side of `side` pixels, each the mean by area of what it covers of
+        the reduced image, which must be as large. Ignored are those that cover an ignored one.
+        """
+        from skimage.transform import resize_local_mean
+
+        camera, k = self.camera, self.downscale
+        scale = side / max(camera.width, camera.height)
+        width, height = (max(1, round(scale * n)) for n in (camera.width, camera.height))
+
+        def resized(image):
+            return resize_local_mean(image, (height, width), channel_axis=-1, preserve_range=True)
+
+        straight = self.image.astype(np.float32)
+        straight[..., :3] *= straight[..., 3:]
+        blocks = straight[: k * camera.height, : k * camera.width]
+        blocks = blocks.reshape(camera.height, k, camera.width, k, 4).mean((1, 3))
+        image = resized(blocks)
+        image[..., :3] /= np.maximum(image[..., 3:], 1 / 255)
+        ignored = self.ignored_crop((0, 0, camera.width, camera.height))
+        if ignored is not None:
+            ignored = resized(ignored[..., None].astype(np.float32))[..., 0] > 0
+        return replace(
+            self,
+            stored_camera=camera.stretched(width, height),
+            image=np.rint(image).astype(np.uint8),
+            downscale=1,
+            unshrunk_camera=self.file_camera,
+            ignored=ignored,
+        )
+
     def crop_camera(
         self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
     ) -> Camera:

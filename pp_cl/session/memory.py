@@ -15,7 +15,7 @@ from pp_cl.engine.device.quirks import compiler_bytes
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.training.needs import Need, Needs
-from pp_cl.engine.training.schedule import averages_from, refine_steps, supersampled_from
+from pp_cl.engine.training.schedule import refinements
 from pp_cl.errors import UserError
 from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
 from pp_cl.scene.listing import DEMO
@@ -72,27 +72,27 @@ class MemoryPlan:
             raise UserError(": ".join(fault))
 
     def check_points(
-        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
+        self, grid: Grid, points: int, depth_range: tuple[float, float], progress: float = 0.0
     ) -> None:
-        """Raise UserError if a training with these points of a grid does not fit from this step on,
+        """Raise UserError if a training with these points of a grid does not fit from then on,
         or if refining gives the grid more vertices than ids can number.
         """
-        self.need = self.need_of(grid, points, depth_range, step)
-        if fault := self.fault_of(grid, points, depth_range, step):
+        self.need = self.need_of(grid, points, depth_range, progress)
+        if fault := self.fault_of(grid, points, depth_range, progress):
             raise UserError(": ".join(fault))
 
     def points_that_fit(
-        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int
+        self, grid: Grid, points: int, depth_range: tuple[float, float], progress: float
     ) -> int:
-        """The largest number of these points with which a training fits from this step on; the
+        """The largest number of these points with which a training fits from then on; the
         others must be dropped before it takes more memory. Raises UserError as check_points() does
         if that is less than LEAST_KEPT of them, or if not even the next steps fit.
         """
-        most, start = points, self.need_of(grid, points, depth_range, step, stretches=1)
-        if not self._fault(start) and self.fault_of(grid, points, depth_range, step):
-            kept = _most(points, lambda n: self.fault_of(grid, n, depth_range, step, FILLED))
+        most, start = points, self.need_of(grid, points, depth_range, progress, stretches=1)
+        if not self._fault(start) and self.fault_of(grid, points, depth_range, progress):
+            kept = _most(points, lambda n: self.fault_of(grid, n, depth_range, progress, FILLED))
             most = kept if kept >= LEAST_KEPT * points else points
-        self.check_points(grid, most, depth_range, step)
+        self.check_points(grid, most, depth_range, progress)
         return most
 
     def coarser_points(self, grid: Grid, points: int, depth_range: tuple[float, float]) -> int:
@@ -113,38 +113,33 @@ class MemoryPlan:
         grid: Grid,
         points: int,
         depth_range: tuple[float, float],
-        step: int = 0,
+        progress: float = 0.0,
         share: float = 1.0,
     ) -> tuple[str, str] | None:
         """(why a training with these points of a grid does not fit into a share of the memory from
-        this step on, what to do), or None if it fits.
+        then on, what to do), or None if it fits.
         """
-        to_come = sum(step < at for at in refine_steps(self._config.train))
+        to_come = sum(progress < at for at in refinements(self._config.train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
         if last.id_count > MOST_IDS:
             return (
                 f"refined {to_come} times, the grid has more than {MOST_IDS} vertices",
                 "refine less often (train.refine_at), or lower --points",
             )
-        return self._fault(self.need_of(grid, points, depth_range, step), share)
-
-    def grows_after(self, step: int) -> bool:
-        """Whether the next step takes more memory: it refines, begins the EMA or supersampling."""
-        begins = averages_from(self._config.train), supersampled_from(self._config.train)
-        return step + 1 in (*refine_steps(self._config.train), *begins)
+        return self._fault(self.need_of(grid, points, depth_range, progress), share)
 
     def need_of(
         self,
         grid: Grid,
         points: int,
         depth_range: tuple[float, float],
-        step: int = 0,
+        progress: float = 0.0,
         stretches: int | None = None,
     ) -> Need:
-        """The Need of a training with these points of a grid from this step on. stretches: how many
+        """The Need of a training with these points of a grid from then on. stretches: how many
         stretches to look ahead, each of which ends where more memory is taken; None: all.
         """
-        needs = self._needs.expected(self._config, points, step, grid, depth_range)
+        needs = self._needs.expected(self._config, points, progress, grid, depth_range)
         return self._need(islice(needs, stretches))
 
     def _need(self, of_stretches):

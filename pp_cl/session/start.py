@@ -11,7 +11,7 @@ from pp_cl.checkpoint import opened_run
 from pp_cl.config import RANDOM, load_config, text_of
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.network.unet import UNet
-from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.engine.training.schedule import refinements
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
 from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
@@ -130,7 +130,7 @@ def fitting_hull(
     views, _, forgiven = agreement
     hull, refine_at = first_hull(dev, config, agreement)
     plan = Plan.of(config, hull, agreement, refine_at)
-    to_come = len(refine_steps(plan.train(config.train)))
+    to_come = len(refinements(plan.train(config.train)))
     cameras = [view.camera for view in views]
     last = math.inf  # points of the previous try
     while True:

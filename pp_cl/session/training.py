@@ -10,7 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
+from pp_cl.checkpoint import (
+    check_finite,
+    load_run_state,
+    opened_run,
+    progress_of,
+    save_checkpoint,
+)
 from pp_cl.config import configure, load_config, refuse_setting, run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
@@ -27,7 +33,7 @@ from pp_cl.engine.stored import (
     training_arrays,
 )
 from pp_cl.engine.training.between import keep_most_visible
-from pp_cl.engine.training.schedule import supersampling_at
+from pp_cl.engine.training.schedule import has_passed, supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_room, check_target
@@ -41,7 +47,7 @@ from pp_cl.run import Run, load
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.listing import list_split, measured_split
 from pp_cl.scene.load import open_scene
-from pp_cl.session.budget import Budget
+from pp_cl.session.clock import MEASURED_AT, Clock, seconds_after
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.session.plan import NEVER, Plan
 from pp_cl.session.start import begin_network, fitting_hull, sheet_of_masks
@@ -71,9 +77,10 @@ class HullFacts(NamedTuple):
 class Training:
     """A training that is ready to begin or to go on. config: its settings, which change with its
     plan. info: what a checkpoint's header holds besides the model's entries. hull: None if it
-    resumes. measured: the views on which train.eval_every measures PSNR. began: time.monotonic()
-    when it was opened; train.minutes count from there. on_preview: called after each preview, if
-    set.
+    resumes. measured: the views on which train.eval_every measures PSNR. seconds: of its steps so
+    far. began: time.monotonic() when it was opened, less the time before an interruption;
+    train.minutes count from there. on_preview: called after each preview, if set. clock: of
+    train.minutes, None without.
     """
 
     folder: RunFolder
@@ -83,17 +90,18 @@ class Training:
     memory_plan: MemoryPlan
     hull: HullFacts | None
     measured: list[View]
+    seconds: float
     began: float
     on_preview: Callable[[], None] | None = field(default=None, init=False)
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the last checkpoint; 0: there is none
-    _earlier: float = field(default=0.0, init=False)  # seconds before it was interrupted
+    clock: Clock | None = field(default=None, init=False)
 
     @property
     def passed(self) -> float:
         """Seconds of train.minutes that have passed, including those before an interruption."""
-        return self._earlier + time.monotonic() - self.began
+        return time.monotonic() - self.began
 
     def run(
         self,
@@ -123,6 +131,8 @@ class Training:
                     f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
                     " --out with a lower network.rate or train.sh_rate"
                 ) from None
+            finally:  # they refer to this, so that nothing would be freed
+                self.trainer.clock = self.trainer.make_room = None
 
     def _check_unchanged(self):
         """Raise UserError if another process has trained into the folder since it was opened."""
@@ -139,41 +149,42 @@ class Training:
     def _run(self, on_step, is_stopped):
         trainer = self.trainer
         with self.folder.open_log(trainer.step) as log:
-            pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            may_stay_coarse = "train.refine_at" in self.config.automatic
-            budget = Budget(self.config, pixels, may_stay_coarse)
-            seconds = self._earlier = log.seconds
-            first = trainer.step + 1
+            train, first = self.config.train, trainer.step + 1
+            self.seconds = max(self.seconds, log.seconds)  # a finished run's are in its log alone
+            trainer.make_room = self._make_room
+            if train.minutes and not trainer.begun:
+                given = 60 * train.minutes / train.members
+                self.clock = Clock(given, lambda: self.passed, trainer.progress, trainer.steps)
+                trainer.clock = self._told
             self._expect_save()
-            while trainer.step < self.config.train.iterations:
-                if self.memory_plan.grows_after(trainer.step):
-                    self._fit_memory()
-                start = time.perf_counter()
+            while trainer.progress < 1:
+                before, start, rates = trainer.progress, time.perf_counter(), trainer.rates()
                 terms = trainer.train_step()
-                took = time.perf_counter() - start
-                seconds += took
-                is_planned = self.config.train.minutes and not trainer.begun
-                if is_planned and (plan := budget.plan(self.config, trainer.step, self.passed)):
-                    place = trainer.model.grid, trainer.views, trainer.step
-                    self._follow(plan.for_grid(self.config.train, *place))
+                self.seconds += time.perf_counter() - start
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
                     self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
-                row = self._after_step(log, terms, seconds)
+                row = self._after_step(log, terms, rates, before)
                 if on_step:
                     on_step(trainer.step, row)
-                if is_stopped() and trainer.step < self.config.train.iterations:
+                if is_stopped() and trainer.progress < 1:
                     self._save(finished=False)
-                    return seconds
+                    return self.seconds
             check_finite(training_arrays(trainer))  # before the EMA replaces the parameters
             start = time.perf_counter()
             trainer.finish()
-            seconds += time.perf_counter() - start
+            self.seconds += time.perf_counter() - start
             # Before the checkpoint: a log row without its checkpoint is made again by resuming,
             # but a finished run is not resumed.
-            row = self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True}
+            row = self._row() | {"points": trainer.model.cloud.count, "finished": True}
             log.write(row | ({"specular": trainer.fitted.scale} if trainer.fitted else {}))
             self._save(finished=True)
-        return seconds
+        return self.seconds
+
+    def _told(self, step):
+        """Trainer.clock of a training with train.minutes."""
+        progress = self.clock(step)
+        self.trainer.steps = self.clock.steps
+        return progress
 
     def _follow(self, plan):
         """Go on with another plan, and store it in config.json."""
@@ -182,19 +193,28 @@ class Training:
             follower.follow(_followed(self.config, self.trainer.begun))
         self.folder.configure(self.config.to_json())
 
-    def _fit_memory(self):
-        """If memory is too small from the next step on, give up supersampling that has not begun;
-        if that is not enough, drop points.
+    def _make_room(self, before):
+        """Before more memory is taken: leave out a refinement for which time is too short; for lack
+        of memory give up supersampling that has not begun, and if that is not enough, drop points.
+        before: the progress before the last step.
         """
         trainer, model, train = self.trainer, self.trainer.model, self.config.train
         count, step = model.cloud.count, trainer.step
-        may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
-        if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
+        due = [at for at in trainer.refine_at if has_passed(at, before, trainer.progress)]
+        if self.clock:
+            made = sum(at <= before for at in trainer.refine_at)
+            is_open = "train.refine_at" in self.config.automatic
+            if due and is_open and not self.clock.pays_to_refine(made):
+                plan, place = Plan.given(self.config).unrefined(due), (model.grid, trainer.views)
+                self._follow(plan.for_grid(self.config.train, *place, trainer.progress))
+            self.clock.begins_anew()
+        may_stop = train.supersampled > 0 and supersampling_at(before, train) == 1
+        if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, before):
             self._follow(Plan.given(self.config).with_one_sample())
             message = f"step {step}: for lack of memory, features are of one sample a pixel"
             warnings.warn(message, stacklevel=2)
         try:
-            most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, step)
+            most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, before)
         except UserError as error:
             self._save(finished=False)
             raise UserError(
@@ -208,29 +228,34 @@ class Training:
             )
             keep_most_visible(trainer, most)
 
-    def _after_step(self, log, terms, seconds):
+    def _after_step(self, log, terms, rates, before):
         """Write the row of the log, the preview and the checkpoint if due, in this order; return
-        the row.
+        the row. rates, before: the step's, and the progress before it.
         """
         trainer, train = self.trainer, self.config.train
-        step, last, row = trainer.step, trainer.step == train.iterations, None
+        step, last, row = trainer.step, trainer.progress >= 1, None
         is_measured = train.eval_every and step % train.eval_every == 0
         measured = self._measure() if is_measured else {}
         if step % train.log_every == 0 or last or is_measured:
-            state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
-            row = self._row(seconds) | terms.get() | state | measured
+            state = {"points": trainer.model.cloud.count, "rates": vars(rates)}
+            row = self._row() | terms.get() | state | measured
             log.write(row)
-        due = step % -(-train.iterations // PREVIEWS) == 0
+        due = any(has_passed(n / PREVIEWS, before, trainer.progress) for n in range(1, PREVIEWS))
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
         due = step % train.checkpoint_every == 0 or time.monotonic() >= self._save_by
         if due and not last:
             self._save(finished=False)
+        if self.clock and has_passed(MEASURED_AT, before, trainer.progress):
+            start = time.perf_counter()
+            trainer.render(trainer.views[0])
+            looking = time.perf_counter() - start
+            self.clock.reserve(seconds_after(train, len(trainer.views), looking, trainer.steps))
         return row
 
-    def _row(self, seconds):
+    def _row(self):
         device = self.trainer.dev.name
-        return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
+        return {"step": self.trainer.step, "seconds": round(self.seconds, 3), "device": device}
 
     def _measure(self):
         """{"test_psnr": mean PSNR of the present model's 8-bit images of the measured views}."""
@@ -248,9 +273,17 @@ class Training:
 
     def _save(self, finished):
         trainer = self.trainer
+        if self.clock:  # first, so that it never has fewer steps than the checkpoint
+            steps = trainer.step if finished else max(trainer.step + 1, round(trainer.steps))
+            train = replace(self.config.train, iterations=steps)
+            self.config = replace(self.config, train=train)
+            self.folder.configure(self.config.to_json())
         header = (
             model_header(trainer.model) | self.info | {"step": trainer.step, "finished": finished}
         )
+        if not finished:
+            header |= {"progress": trainer.progress}
+            header |= {"seconds": round(self.seconds, 3), "passed": round(self.passed, 3)}
         header |= {"exposed": trainer.exposed} if trainer.exposed else {}
         header |= {} if finished else {"averaged": bool(trainer.optimiser.averages)}
         arrays = model_arrays(trainer.model) if finished else training_arrays(trainer)
@@ -271,9 +304,11 @@ class Training:
         """The model trained so far as a Run, to be rendered between two steps. It uses the
         trainer's renderer, as one of its own would freeze the network.
         """
-        header = self.info | {"step": self.trainer.step, "finished": False}
-        run = Run(self.trainer.dev, self.folder, self.config, header, self.trainer.model)
-        run.renderer = self.trainer.renderer
+        trainer = self.trainer
+        header = self.info | {"step": trainer.step, "progress": trainer.progress}
+        header["finished"] = False
+        run = Run(trainer.dev, self.folder, self.config, header, trainer.model)
+        run.renderer = trainer.renderer
         return run
 
     def _rendered(self, view):
@@ -300,7 +335,8 @@ def open_training(
     memory complete the plan in config. Raises UserError for a scene that is broken or not the
     checkpoint's, for too little memory, and for a folder that cannot be written.
     """
-    began, (header, arrays) = time.monotonic(), stored or ({"step": 0}, {})
+    header, arrays = stored or ({"step": 0}, {})
+    began = time.monotonic() - header.get("passed", 0.0)
     check_target(folder.config)
     folder.check_sheets(header["step"])
     begun = header["step"] if header.get("finished") else header.get("extended_from", 0)
@@ -311,7 +347,8 @@ def open_training(
     memory_plan = MemoryPlan(followed, net, split_files.image_files)
     if stored:
         grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-        memory_plan.points_that_fit(grid, points, header["depth_range"], header["step"])
+        progress = progress_of(header | {"finished": False}, config.train.iterations)
+        memory_plan.points_that_fit(grid, points, header["depth_range"], progress)
     else:
         memory_plan.check_unseen()
     scene = open_scene(dev, config, ("train",), listed={"train": split_files})
@@ -338,14 +375,16 @@ def open_training(
         info["initial_points"] = model.cloud.count
     trainer = Trainer(dev, followed, model, views)
     if stored:
-        restore_training(trainer, header["step"], arrays, begun, header.get("exposed", ""))
+        state = header["step"], arrays, begun, header.get("exposed", ""), progress
+        restore_training(trainer, *state)
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = []
     if config.train.eval_every:
         split = measured_split(config.scene.path)
         measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
-    return Training(folder, config, trainer, info, memory_plan, facts, measured, began)
+    seconds = header.get("seconds", 0.0)
+    return Training(folder, config, trainer, info, memory_plan, facts, measured, seconds, began)
 
 
 def _check_scene(folder, config, header, views):
@@ -419,7 +458,9 @@ def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Conf
     """
     yield folder, config
     if config.train.members > 1:
-        config = Plan.given(load_config(folder.config)).settings(config)
+        first = load_config(folder.config)
+        config = Plan.given(first).settings(config)
+        config.train.iterations = first.train.iterations
     for i in range(1, config.train.members):
         seed = (config.train.seed + i) % 2**32
         train = replace(config.train, seed=seed, members=1, minutes=0.0)

@@ -74,9 +74,7 @@ EARLY_STOP = 1e-4  # the viewers' value
 # nothing, but viewers have dark backgrounds, too. After 150 steps ethiopian_head has 0.3 dB more
 # over black, and as much as before over white.
 MASK_WEIGHT = 0.5
-# The kernels are built in the first steps; after TIMED steps, the time of a step is known. A fit
-# with limited minutes makes at least FEWEST steps.
-BUILDING, TIMED, FEWEST = 3, 10, 40
+FEWEST = 40  # steps of a fit, however little time it has
 # Standard deviation of a Gaussian before the fit, in radii of the soft disc: the root of the disc's
 # second moment (alpha falls linearly to its rim). With its opacity it covers 0.91 of it.
 DEVIATION = 0.39
@@ -149,7 +147,7 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     training views show. cell: voxel sizes; the points in a cube of this side begin as one; 0: each
     alone. Their SH are 3D Gaussian splatting's, with sRGB colour as the first three features.
     """
-    end = time.monotonic() + 60 * minutes
+    began = time.monotonic()
     dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the fit does the rest
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
@@ -163,18 +161,19 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     config = config_of(run, steps)
     reduced = [view.reduced(factor * view.downscale) for view in views]
     trainer = Trainer(dev, config, model, reduced, crops=WindowCrops)
-    with Progress("fitting Gaussians", steps, "step") as progress:
-        while trainer.step < config.train.iterations:
+    prepared = time.monotonic()
+
+    def clock(step):
+        time_left = max(60 * minutes - (prepared - began), 1e-9)
+        passed = (time.monotonic() - prepared) / time_left
+        return max(step / steps, min(passed, step / min(FEWEST, steps)))
+
+    trainer.clock = clock
+    with Progress("fitting Gaussians", 100, "%") as progress:
+        while trainer.progress < 1:
+            before = trainer.progress
             trainer.train_step()
-            progress.update()
-            if trainer.step == BUILDING:
-                first = time.monotonic()
-            if trainer.step == TIMED and minutes < math.inf:
-                now = time.monotonic()
-                fitting = TIMED + int((end - now) * (TIMED - BUILDING) / (now - first))
-                progress.total = min(max(fitting, FEWEST), steps)
-                config = replace(config, train=replace(config.train, iterations=progress.total))
-                trainer.follow(config)
+            progress.update(int(100 * trainer.progress) - int(100 * before))
     trainer.check()
     trainer.finish()
     return cloud

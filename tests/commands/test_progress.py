@@ -105,8 +105,8 @@ def test_a_training_tells_its_rate_points_and_memory(kind):
     trainer = SimpleNamespace(step=100, dev=SimpleNamespace(bytes=3 * 2**29))
     train = SimpleNamespace(iterations=400, minutes=0, members=1)
     config = SimpleNamespace(train=train)
-    stream = kind()
-    with TrainingProgress(SimpleNamespace(trainer=trainer, config=config), stream) as follower:
+    stream, training = kind(), SimpleNamespace(trainer=trainer, config=config, clock=None)
+    with TrainingProgress(training, stream) as follower:
         until(stream, "building kernels (once): 00:0")
         follower(101, None)
         follower(102, None)
@@ -115,3 +115,20 @@ def test_a_training_tells_its_rate_points_and_memory(kind):
         follower(104, ROW)
         until(stream, "PSNR 27.31 (test 25.50), 1200 points, 1.50 GiB")
         until(stream, "training: 104 of 400 steps" if kind is io.StringIO else "104/400")
+
+
+def test_a_training_by_minutes_tells_how_many_steps_they_allow():
+    trainer = SimpleNamespace(step=0, steps=250.4, dev=SimpleNamespace(bytes=0))
+    config = SimpleNamespace(
+        train=SimpleNamespace(iterations=8000, minutes=2.5, members=1), preset="small"
+    )
+    training = SimpleNamespace(trainer=trainer, config=config, clock=True, passed=0.0)
+    stream = io.StringIO()
+    with TrainingProgress(training, stream) as follower:
+        for step in range(1, 14):
+            follower(step, None)
+    told = "2.5 min: small, 250 steps at this pace (its own are 6000); with fewer than 1000 it"
+    assert (
+        f"{told} stays blurred: it needs some 10 minutes, or a smaller --preset"
+        in stream.getvalue()
+    )

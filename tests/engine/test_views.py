@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,23 @@ def test_reduced_too_far(view, downscale):
     low = View("a.png", view.stored_camera.crop(0, 0, 70, 15), view.image[:15])
     with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
         low.reduced(1)
+
+
+def test_of_another_size(view, rng):
+    """Each pixel is the mean by area of what it covers, with premultiplied colours."""
+    image = rng.integers(1, 256, (50, 70, 4), dtype=np.uint8)
+    ignored = np.zeros((50, 70), bool)
+    ignored[49, 0] = True
+    smaller = replace(view, image=image, ignored=ignored).of_size(28)  # 2.5 pixels each
+    camera = smaller.camera
+    assert (camera.width, camera.height, camera.fx, camera.cy) == (28, 20, 24, 10)
+    premultiplied = image.astype(np.float64)
+    premultiplied[..., :3] *= premultiplied[..., 3:] / 255
+    fine = premultiplied.repeat(2, 0).repeat(2, 1).reshape(20, 5, 28, 5, 4).mean((1, 3))
+    fine[..., :3] *= 255 / fine[..., 3:]
+    np.testing.assert_allclose(smaller.image, fine, atol=0.51)
+    assert np.argwhere(smaller.ignored).tolist() == [[19, 0]]
+    np.testing.assert_array_equal(replace(view, image=image).of_size(70).image, image)
 
 
 @pytest.mark.parametrize("downscale", (1, 2, 3))

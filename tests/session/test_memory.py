@@ -101,12 +101,13 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     assert 0 < max(local) <= 32 * 1024
 
 
-@pytest.mark.parametrize("steps, at", [((60,), 44), ((6, 60), 44)], ids=["new", "extended"])
+@pytest.mark.parametrize("steps, at", [((60,), 45), ((6, 60), 45)], ids=["new", "extended"])
 def test_what_was_to_be_supersampled_is_given_up_before_points(
     tmp_path, monkeypatch, capsys, steps, at
 ):
-    def fault_of(self, grid, points, depth_range, step=0, share=1.0):
-        return ("little", "") if self._config.train.supersampled and step > 10 else None
+    def fault_of(self, grid, points, depth_range, progress=0.0, share=1.0):
+        train = self._config.train
+        return ("little", "") if train.supersampled and train.iterations * progress > 10 else None
 
     monkeypatch.setattr(MemoryPlan, "fault_of", fault_of)
     folder, scene = RunFolder(tmp_path / "run"), write_ball_scene(tmp_path / "ball")
@@ -156,22 +157,22 @@ def test_each_compute_unit_has_memory_of_its_own(dev, cpu_form, plain, monkeypat
     assert np.ptp(planned) == pytest.approx(np.ptp(taken), rel=0.01)
 
 
-def needed(dev, base="tiny", points=171_262, step=0, **changes):
-    return memory_plan(dev, base, **changes).need_of(GRID, points, (2, 6), step)
+def needed(dev, base="tiny", points=171_262, progress=0.0, **changes):
+    return memory_plan(dev, base, **changes).need_of(GRID, points, (2, 6), progress)
 
 
 def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     once = {"train__refine_at": "0.35,1", "train__supersampled": "0"}
-    halfway = needed(dev, "small", points=118_025, step=600, **once)
+    halfway = needed(dev, "small", points=118_025, progress=0.1, **once)
     assert halfway.points < needed(dev, "small", **once).points  # it still fits
-    last = needed(dev, "small", points=600_000, step=4000, **once)
+    last = needed(dev, "small", points=600_000, progress=0.67, **once)
     assert last.points == 600_000
 
 
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
     made = memory_plan(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
     finer = Grid(GRID.origin, GRID.voxel_size / 2, tuple(2 * n for n in GRID.dims))
-    planned, later = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
+    planned, later = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 0.875)
     assert planned.points == later.points == 160_000
     assert later.device == pytest.approx(planned.device, rel=0.01)
 
@@ -241,21 +242,21 @@ def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
 
 
 def test_what_does_not_fit_any_more_is_dropped_but_for_half(plain):
-    made, (points, step) = memory_plan(plain, train__refine_at="0.4,1"), (20_000, 3000)
-    plain.info["memory_bytes"] = made.need_of(GRID, points, (2, 6), step).device
-    assert made.points_that_fit(GRID, points, (2, 6), step) == points
-    assert made.points_that_fit(GRID, 3 * points // 2, (2, 6), step) > 3 * points // 4
+    made, (points, done) = memory_plan(plain, train__refine_at="0.4,1"), (20_000, 0.375)
+    plain.info["memory_bytes"] = made.need_of(GRID, points, (2, 6), done).device
+    assert made.points_that_fit(GRID, points, (2, 6), done) == points
+    assert made.points_that_fit(GRID, 3 * points // 2, (2, 6), done) > 3 * points // 4
     assert made.need.device == pytest.approx(FILLED * plain.info["memory_bytes"], rel=1e-3)
     with pytest.raises(UserError, match="needs"):
-        made.points_that_fit(GRID, 3 * points, (2, 6), step)
+        made.points_that_fit(GRID, 3 * points, (2, 6), done)
 
 
 def test_what_the_next_steps_take_is_not_dropped(plain):
     made = memory_plan(plain, train__refine_at="0.4,1")
-    plain.info["memory_bytes"] = made.need_of(GRID, 100_000, (2, 6), 7900).device
-    assert made.points_that_fit(GRID, 100_000, (2, 6), 7900) == 100_000
+    plain.info["memory_bytes"] = made.need_of(GRID, 100_000, (2, 6), 0.99).device
+    assert made.points_that_fit(GRID, 100_000, (2, 6), 0.99) == 100_000
     with pytest.raises(UserError, match="needs"):
-        made.points_that_fit(GRID, 101_000, (2, 6), 7900)
+        made.points_that_fit(GRID, 101_000, (2, 6), 0.99)
 
 
 @pytest.mark.slow
@@ -274,13 +275,13 @@ def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_lear
     settings |= {"downscale": 1, "points__count": 5000}
     plain.info["memory_bytes"] = 30 * MIB
     assert main(arguments(scene, tmp_path / "fewer", **settings)) == 0
-    dropped, count = map(int, re.search(r"19: .* (\d+) of (\d+)", capsys.readouterr().err).groups())
+    dropped, count = map(int, re.search(r"20: .* (\d+) of (\d+)", capsys.readouterr().err).groups())
     assert 0.1 < dropped / count < 0.5 and plain.peak_bytes > (FILLED - 0.15) * 30 * MIB
 
     plain.info["memory_bytes"] = 20 * MIB
     words = arguments(scene, tmp_path / "run", **settings)
     error = failure(*words)
-    assert "step 19: to go on with " in error and error.endswith("in another --out")
+    assert "step 20: to go on with " in error and error.endswith("in another --out")
     plain.info["memory_bytes"] = GIB
     assert main(words) == 0
     assert "resuming at step 19 " in capsys.readouterr().out

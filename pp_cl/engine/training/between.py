@@ -17,6 +17,8 @@ from pp_cl.engine.training.schedule import (
     SMOOTHING_EVERY,
     Rates,
     ema_weight,
+    growths,
+    has_passed,
     supersampling_at,
 )
 from pp_cl.engine.training.smooth import Smoother
@@ -27,11 +29,17 @@ if TYPE_CHECKING:
     from pp_cl.engine.step import Trainer
 
 
-def after_update(trainer: Trainer, rates: Rates) -> None:
+def after_update(trainer: Trainer, rates: Rates, before: float) -> None:
     """Decide on exposure, smooth the SH coefficients, update the EMA, prune and refine, each if it
-    is due after this step.
+    is due after this step. before: the training's progress at its beginning.
     """
     train, step = trainer.config.train, trainer.step
+
+    def passes(shares):
+        return any(has_passed(share, before, trainer.progress) for share in shares)
+
+    if trainer.make_room and passes(growths(train)):
+        trainer.make_room(before)
     for is_last in (False, True):
         due = step == decided_at(trainer.begun, len(trainer.views), is_last=is_last)
         if trainer.exposure and due:
@@ -41,15 +49,15 @@ def after_update(trainer: Trainer, rates: Rates) -> None:
     if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
         with trainer.dev.stage("smoothing"):
             smooth(trainer, rates)
-    weight = ema_weight(step, train.iterations) if train.ema else 0
+    weight = ema_weight(before, trainer.progress) if train.ema else 0
     if weight > 0:
         with trainer.dev.stage("averages"):
             trainer.optimiser.update_ema(weight)
     is_judged = train.prune_weight > 0 and step % train.prune_every == 0
-    if is_judged and step < train.iterations:
+    if is_judged and trainer.progress < 1:
         with trainer.dev.stage("pruning"):
             prune(trainer)
-    if step in trainer.refine_steps:
+    if passes(trainer.refine_at):
         with trainer.dev.stage("refining"):
             refine(trainer)
 
@@ -113,13 +121,13 @@ def finish(trainer: Trainer) -> None:
 def fit_specular(trainer: Trainer) -> None:
     """Fit a specular layer, and keep it if it helps on views that it was not fitted to."""
     train = trainer.config.train
-    trainer.renderer.supersampling = supersampling_at(trainer.step, train)
+    trainer.renderer.supersampling = supersampling_at(trainer.progress, train)
 
     def target(index):
         return whole_target(trainer, index)
 
     fit = SpecularFit(trainer.renderer, trainer.views, target, trainer.gamma, train.seed)
-    trainer.fitted = fit.fitted(fit_steps(train.iterations))
+    trainer.fitted = fit.fitted(fit_steps(trainer.step))
     trainer.model.specular = trainer.fitted.layer
 
 

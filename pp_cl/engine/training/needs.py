@@ -65,16 +65,16 @@ class Needs:
         self,
         config: Config,
         points: int,
-        step: int = 0,
+        progress: float = 0.0,
         grid: Grid | None = None,
         depth_range: tuple[float, float] = (0.0, 0.0),
     ) -> Iterator[Need]:
-        """Yield the Need of each stretch that a training has from this step on, when it has
+        """Yield the Need of each stretch that a training has from this progress on, when it has
         `points` points of the grid; without a grid, points with the smallest footprints. Its `host`
         is what refining after the stretch takes.
         """
         radius = self._radius(config.raster, grid, depth_range) if grid else 0.0
-        stretches = [*expected_stretches(config.train, points, step)]
+        stretches = [*expected_stretches(config.train, points, progress)]
         for stretch in stretches:
             # soft points are as wide as the spacing of points, and refining halves it
             halved = stretches[0].refinements - stretch.refinements

@@ -1,5 +1,6 @@
-"""The schedules of a training, as functions of the step (0 to steps - 1): learning rates, gamma,
-loss weights, pruning, refining and EMA.
+"""The schedules of a training: learning rates, gamma, loss weights, and when it prunes, refines,
+averages and supersamples. They are functions of its progress, which goes from 0 to 1: the share of
+train.iterations that is done, or of train.minutes that has passed.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from pp_cl.settings import NetworkConfig, TrainConfig
 
 GAMMA = (0.1, 0.01)  # depth sharpness of the softmax, first and last step (supplemental)
 SH_DECAY = 0.1  # last over first learning rate of the SH (supplemental)
-SH_DELAY = (0.0, 0.01, 0.02)  # warm-up of SH degrees 0, 1, 2, as a share of the iterations
+SH_DELAY = (0.0, 0.01, 0.02)  # progress until which SH degrees 0, 1, 2 warm up
 SMOOTHING_EVERY = 64  # steps
 PRUNE_LOOKS = 100  # steps that must have had a point in view before it may be pruned
-EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
+EMA_FROM = 0.85  # progress at which averages begin
+EMA_UPDATES = 200  # times the averages would be updated in the whole training
+EMA_TIME = 0.05  # their time constant
 DELAYED = 0.01  # of a learning rate, at the first step of its warm-up
 # About the share of the points that pruning leaves by the next refinement or the last step: 0.45 to
 # 0.73 on lego with the presets tiny, small and full.
@@ -35,53 +38,42 @@ class Rates:
     network: float
 
     @classmethod
-    def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
-        """The rates of a step from 0 on."""
-        steps = train.iterations
+    def at(cls, progress: float, steps: float, network: NetworkConfig, train: TrainConfig) -> Rates:
+        """The rates of a step. steps: how many the training has in all."""
         # in a long training these travel about as far as in a short one: at full rates they end
         # noisier
         scale = math.sqrt(min(1.0, train.rate_steps / steps or 1.0))
         sh = tuple(
-            slower
-            * learning_rate(step, steps, first, first * SH_DECAY, delay_steps=round(delay * steps))
-            if first
-            else 0.0
+            slower * learning_rate(progress, first, first * SH_DECAY, delay) if first else 0.0
             for first, delay, slower in zip(
                 train.sh_rate, SH_DELAY, (1.0, scale, scale), strict=True
             )
         )
-        opacity = scale * learning_rate(step, steps, *train.opacity_rate)
+        opacity = scale * learning_rate(progress, *train.opacity_rate)
         return cls(
             sh,
-            learning_rate(step, steps, *train.offset_rate) if train.offset_rate[0] else 0.0,
+            learning_rate(progress, *train.offset_rate) if train.offset_rate[0] else 0.0,
             opacity,
             0.0 if train.view_opacity == "off" else opacity,
-            learning_rate(step, steps, *network.rate),
+            learning_rate(progress, *network.rate),
         )
 
 
-def learning_rate(
-    step: int, steps: int, first: float, last: float, *, delay_steps: int = 0
-) -> float:
+def learning_rate(progress: float, first: float, last: float, delay: float = 0.0) -> float:
     """Exponential decay from `first` to `last` with a warm-up (mip-NeRF's learning_rate_decay).
 
-    The warm-up multiplies by DELAYED at step 0 and rises to 1 at `delay_steps` as a quarter sine;
-    delay_steps 0: none.
+    The warm-up multiplies by DELAYED at first and rises to 1 at the progress `delay` as a quarter
+    sine; delay 0: none.
     """
-    rate = first * (last / first) ** min(step / steps, 1)
-    if delay_steps == 0:
+    rate = first * (last / first) ** min(progress, 1)
+    if delay == 0:
         return rate
-    return rate * (DELAYED + (1 - DELAYED) * math.sin(math.pi / 2 * min(step / delay_steps, 1)))
+    return rate * (DELAYED + (1 - DELAYED) * math.sin(math.pi / 2 * min(progress / delay, 1)))
 
 
-def supersampled_from(train: TrainConfig) -> int:
-    """The first step, from 0 on, that is supersampled; train.iterations for none."""
-    return round((1 - train.supersampled) * train.iterations)
-
-
-def supersampling_at(step: int, train: TrainConfig) -> int:
-    """RenderResult.supersampling of a step, counted from 0, and of renderings made before it."""
-    return 2 if train.supersampled > 0 and step >= supersampled_from(train) else 1
+def supersampling_at(progress: float, train: TrainConfig) -> int:
+    """RenderResult.supersampling of a step, and of renderings made before the next one."""
+    return 2 if train.supersampled > 0 and progress >= 1 - train.supersampled else 1
 
 
 def prunings(train: TrainConfig, start: int, end: int) -> int:
@@ -94,19 +86,34 @@ def prunings(train: TrainConfig, start: int, end: int) -> int:
     return max(0, last // every - -(-(start + PRUNE_LOOKS) // every) + 1)
 
 
-def refine_steps(train: TrainConfig) -> list[int]:
-    """The steps after which the grid is refined, ascending.
+def refinements(train: TrainConfig) -> list[float]:
+    """The progresses at which the grid is refined, ascending.
 
-    Each refinement makes eight points of one. So a training that prunes leaves out a refinement
-    before which nothing could have been pruned since the last one.
+    Each refinement makes eight points of one. So a training of so many iterations that prunes
+    leaves out a refinement before which nothing could have been pruned since the last one.
     """
-    shares = (share for share in train.refine_at if 0 < share < 1)
-    steps = sorted({max(1, round(share * train.iterations)) for share in shares})
-    kept = steps[:1]
-    for step in steps[1:]:
-        if prunings(train, kept[-1], step) or train.prune_weight == 0:
-            kept.append(step)
+    shares = sorted({share for share in train.refine_at if 0 < share < 1})
+    kept = shares[:1]
+    for share in shares[1:]:
+        between = (math.ceil(at * train.iterations) for at in (kept[-1], share))
+        if train.minutes or train.prune_weight == 0 or prunings(train, *between):
+            kept.append(share)
     return kept
+
+
+def growths(train: TrainConfig) -> list[float]:
+    """The progresses from which on a training takes more memory."""
+    averaged = [EMA_FROM] if train.ema else []
+    return [
+        *refinements(train),
+        *averaged,
+        *([1 - train.supersampled] if train.supersampled else []),
+    ]
+
+
+def has_passed(share: float, before: float, after: float) -> bool:
+    """Whether a step passes this share, which takes the progress from `before` to `after`."""
+    return before < share <= after
 
 
 @dataclass(frozen=True)
@@ -121,61 +128,57 @@ class Stretch:
     supersampling: int
 
 
-def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[Stretch]:
-    """The stretches of a training that has `points` points at `step`. The numbers of points that
-    later prunings leave are estimates.
+def expected_stretches(train: TrainConfig, points: int, progress: float) -> Iterator[Stretch]:
+    """The stretches of a training that has `points` points now. The numbers of points that later
+    prunings leave are estimates.
     """
-    refined, averaged, start = refine_steps(train), averages_from(train), 0
-    ends = {*refined, int(min(averaged, train.iterations)), supersampled_from(train)}
-    stages = 0, *refined, train.iterations
-    for end in sorted(ends | {train.iterations}):
-        if step < end:
-            now = max(start, step)
-            refinements = sum(now < at for at in refined)
-            yield Stretch(points, refinements, averaged <= now, supersampling_at(now, train))
-            stage = max(at for at in stages if at <= start), min(at for at in stages if at >= end)
-            to_come = prunings(train, now, end) / max(1, prunings(train, *stage))
-            points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)
+    refined, start = refinements(train), 0.0
+    ends = {*refined, EMA_FROM if train.ema else 1.0, 1 - train.supersampled, 1.0}
+    stages = 0.0, *refined, 1.0
+    for end in sorted(ends):
+        if progress < end:
+            now = max(start, progress)
+            to_come = sum(now < at for at in refined)
+            is_averaged = train.ema and now >= EMA_FROM
+            yield Stretch(points, to_come, is_averaged, supersampling_at(now, train))
+            first = max(at for at in stages if at <= start)
+            last = min(at for at in stages if at >= end)
+            steps = (math.ceil(at * train.iterations) for at in (first, last))
+            pruned = (end - now) / (last - first) if prunings(train, *steps) else 0.0
+            points = round(points * LEFT_BY_PRUNING**pruned) * (8 if end in refined else 1)
         start = end
 
 
-def averages_from(train: TrainConfig) -> float:
-    """The step from which on averages are kept, infinite for never."""
-    return ema_start(train.iterations) if train.ema else math.inf
-
-
-def gamma_at(step: int, steps: int) -> float:
+def gamma_at(progress: float) -> float:
     """Depth sharpness gamma of the softmax, exponential along GAMMA."""
-    return learning_rate(step, steps, *GAMMA)
+    return learning_rate(progress, *GAMMA)
 
 
-def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
+def rising_weight(progress: float, last: float = 1.0) -> float:
     """A loss weight that rises linearly from 0 to `last`, for the distortion loss and for alphas
     below the mask: at first there is no surface that these could make sharp or opaque.
     """
-    return last * step / steps
+    return last * progress
 
 
-def late_weight(step: int, steps: int, last: float) -> float:
-    """A loss weight that is 0 in the first three quarters of the steps and rises to `last` within a
+def late_weight(progress: float, last: float) -> float:
+    """A loss weight that is 0 in the first three quarters of a training and rises to `last` in a
     twentieth, for the depth loss: a surface must be found before it can be smoothed.
     """
-    return last * min(1.0, max(0.0, (step / steps - 0.75) / 0.05))
+    return last * min(1.0, max(0.0, (progress - 0.75) / 0.05))
 
 
-def ema_start(steps: int) -> int:
-    """The step after which the EMA begins."""
-    return 17 * steps // 20
+def ema_weight(before: float, after: float) -> float:
+    """Weight of the present parameters in their exponential moving average, after a step that takes
+    the progress from `before` to `after`; 0 where no update is due.
 
-
-def ema_weight(step: int, steps: int) -> float:
-    """Weight of the present parameters in their exponential moving average; 0 where no update is
-    due.
-
-    The average starts as a copy (weight 1) at 17/20 of the steps, then takes 1 - exp(-k/(steps/20))
-    every k = steps/200 steps: a time constant of a twentieth of the training, in ten updates.
+    The average starts as a copy (weight 1) at EMA_FROM, and is updated EMA_UPDATES times in a whole
+    training, or each step if these are fewer, with a time constant of EMA_TIME.
     """
-    every, since = max(1, steps // EMA_UPDATES), step - ema_start(steps)
-    if since < 0 or since % every:
+    if after < EMA_FROM:
         return 0.0
-    return 1.0 if since == 0 else 1 - math.exp(-every / (0.05 * steps))
+    if before < EMA_FROM:
+        return 1.0
+    # counted from EMA_FROM; a rounding below a whole number counts as that
+    first, last = (math.floor((at - EMA_FROM) * EMA_UPDATES + 1e-6) for at in (before, after))
+    return 1 - math.exp(-(last - first) / (EMA_TIME * EMA_UPDATES))

@@ -11,7 +11,7 @@ from pp_cl.engine.training.schedule import (
     gamma_at,
     late_weight,
     learning_rate,
-    refine_steps,
+    refinements,
     rising_weight,
 )
 from pp_cl.settings import NetworkConfig, TrainConfig
@@ -20,44 +20,41 @@ from pp_cl.settings import NetworkConfig, TrainConfig
 @pytest.mark.parametrize(
     ("arguments", "values"),
     [
-        ((0.5, 0.05, 0), {0: 0.5, 250: 0.49428, 25000: 0.15811, 50000: 0.05}),
-        ((0.125, 0.0125, 1000), {0: 0.00125, 500: 0.08673, 1000: 0.11937, 50000: 0.0125}),
+        ((0.5, 0.05, 0.0), {0: 0.5, 250: 0.49428, 25000: 0.15811, 50000: 0.05}),
+        ((0.125, 0.0125, 0.02), {0: 0.00125, 500: 0.08673, 1000: 0.11937, 50000: 0.0125}),
     ],
 )
 def test_published_rates(arguments, values):
-    first, last, delay_steps = arguments
     for step, value in values.items():
-        rate = learning_rate(step, 50000, first, last, delay_steps=delay_steps)
-        assert rate == pytest.approx(value, abs=6e-6)
+        assert learning_rate(step / 50000, *arguments) == pytest.approx(value, abs=6e-6)
 
 
 def test_gamma():
-    gammas = [gamma_at(step, 50000) for step in (0, 25000, 50000)]
+    gammas = [gamma_at(progress) for progress in (0, 0.5, 1)]
     assert gammas == pytest.approx([0.1, 0.031623, 0.01], abs=5e-7)
 
 
 def test_the_distortion_weight_rises_from_nothing():
-    weights = [rising_weight(step, 200, 3.0) for step in range(200)]
+    weights = [rising_weight(step / 200, 3.0) for step in range(200)]
     assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
     np.testing.assert_allclose(np.diff(weights), 3 / 200)
 
 
 def test_the_depth_weight_rises_in_the_last_quarter():
-    weights = [late_weight(step, 200, 3.0) for step in (0, 150, 155, 160, 199)]
+    weights = [late_weight(step / 200, 3.0) for step in (0, 150, 155, 160, 199)]
     assert weights == pytest.approx([0, 0, 1.5, 3, 3])
 
 
 @pytest.mark.parametrize(
     "shares, iterations, changes, expected",
     [
-        ("0.33,0.67", 11_000, {}, [3630, 7370]),
-        ("0.33,0.67", 60, {}, [20]),  # no second one, as no pruning follows the first
-        ("0.33,0.67", 500, {}, [165]),  # at the pruning at 250, points were seen only 85 times
-        ("0.33,0.67", 2, {}, [1]),
-        ("0.33,0.67", 60, {"train.prune_weight": 0}, [20, 40]),
-        ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
+        ("0.33,0.67", 11_000, {}, [0.33, 0.67]),
+        ("0.33,0.67", 60, {}, [0.33]),  # no second one, as no pruning follows the first
+        ("0.33,0.67", 500, {}, [0.33]),  # at the pruning at 250, points were seen only 85 times
+        ("0.33,0.67", 60, {"train.prune_weight": 0}, [0.33, 0.67]),
+        ("0.5,0.5", 100, {"train.prune_weight": 0}, [0.5]),
         ("1,1", 8000, {}, []),
-        ("0,0", 8000, {}, []),  # the steps are not decided yet
+        ("0,0", 8000, {}, []),  # not decided yet
     ],
 )
 def test_a_refinement_needs_a_pruning_since_the_one_before(shares, iterations, changes, expected):
@@ -68,17 +65,23 @@ def test_a_refinement_needs_a_pruning_since_the_one_before(shares, iterations, c
         **changes,
     }.items():
         assign(config, key, value, "test")
-    assert refine_steps(config.train) == expected
+    assert refinements(config.train) == expected
 
 
 def test_ema_weight():
-    weights = [ema_weight(step, 3500) for step in range(3500)]
-    due = [step for step, weight in enumerate(weights) if weight]
-    assert due == list(range(2975, 3500, 17))
-    assert weights[2975] == 1
-    assert weights[2992] == weights[due[-1]] == pytest.approx(1 - math.exp(-17 / 175))
-    for steps in (1, 2, 7):  # short trainings average, too
-        assert next(filter(None, (ema_weight(step, steps) for step in range(steps)))) == 1
+    def of_steps(steps):
+        return {n: ema_weight((n - 1) / steps, n / steps) for n in range(1, steps + 1)}
+
+    weights = of_steps(4000)
+    due = [step for step, weight in weights.items() if weight]
+    assert due == list(range(3400, 4001, 20))
+    assert weights[3400] == 1
+    np.testing.assert_allclose([weights[step] for step in due[1:]], 1 - math.exp(-20 / 200))
+    for steps in (1, 2, 7, 60):  # short trainings average each step, about as far back
+        first, *others = filter(None, of_steps(steps).values())
+        assert first == 1 and len(others) == steps - math.ceil(0.85 * steps)
+        kept = math.prod(1 - weight for weight in others)
+        assert kept == pytest.approx(math.exp(-len(others) / steps / 0.05), rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +89,7 @@ def test_ema_weight():
 )
 def test_what_is_slower_in_longer_trainings(steps, meant_for, scale):
     settings = TrainConfig(iterations=steps, rate_steps=meant_for)
-    first, last = (Rates.at(step, NetworkConfig(), settings) for step in (0, steps))
+    first, last = (Rates.at(share, steps, NetworkConfig(), settings) for share in (0, 1))
     assert (first.opacity, last.opacity) == pytest.approx((0.03 * scale, 0.01 * scale))
     assert last.sh == pytest.approx((0.05, 0.025 * scale, 0.0125 * scale))
     assert (first.network, last.network) == pytest.approx((1e-3, 1e-4))
