@@ -27,19 +27,21 @@ def evaluate_run(
     device: str | None = None,
     scene: str | None = None,
     out: Path | str | None = None,
+    size: int = 0,
 ) -> dict[str, Any]:
     """Measure a run, or the run in a folder, as `pp-cl eval` does. Writes metrics.json, whose
     content it returns, and comparison.png into the folder `out`; None: RUN/eval for the split test,
     RUN/eval/SPLIT for others. If the run's images differed in colour, renderings are also measured
     with the images' colours, by coloured_alike().
 
-    metrics: from psnr, ssim and lpips. save_images: also write every view to images/. device,
-    scene: as in load(), for a folder. Raises UserError for a missing or broken split, and for files
-    that would be lost.
+    size: pixels of the views' longer side, drawn and measured so, in RUN/eval/size-SIZE; 0: as in
+    the training. metrics: from psnr, ssim and lpips. save_images: also write every view to images/.
+    device, scene: as in load(), for a folder. Raises UserError for a missing or broken split, for
+    views smaller than `size`, and for files that would be lost.
     """
     run = run if isinstance(run, Run) else load(run, device, scene=scene)
-    target = run.folder.evaluation(split) if out is None else Path(out)
-    here = run.scene(split)
+    target = run.folder.evaluation(split, size) if out is None else Path(out)
+    here = run.scene(split, size)
     views = here.splits[split]
     images = [target / "images" / file for file in image_paths([view.name for view in views])]
     measure = Metrics(run.dev, metrics)
@@ -80,7 +82,11 @@ def evaluate_run(
     points = {"initial": header["initial_points"], "final": run.model.cloud.count}
     published = published_rows(here.name, cameras)
     differs = differences(here.name, cameras, views[0].file_downscale, split) if published else ""
+    if published and size:
+        differs = f"here: images of {size} pixels"
+    width, height = max((view.camera.width, view.camera.height) for view in views)
     result |= {
+        "size": [width, height],
         "step": header["step"],
         "finished": header["finished"],
         "points": points | {"grid": header["grid"]["dims"]},

@@ -11,6 +11,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.run import load
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,20 @@ def test_the_files_hold_what_was_measured_and_shown(run, capsys):
     assert main(["eval", str(run)]) == 0
     again = json.loads((run / "eval" / "metrics.json").read_text())
     assert again["per_image"] == result["per_image"]
+
+
+def test_views_of_another_size(run, capsys):
+    """At the training's own size the figures are the same but for eight bits a channel."""
+    longest = load(run).cameras("test")[0].width
+    means = []
+    for words in ([], ["--size", str(longest)], ["--size", str(longest + 5)]):
+        assert main(["eval", str(run), *words]) == 0
+        folder = run / "eval" / "-".join(["size", *words[1:]]) if words else run / "eval"
+        means.append(json.loads((folder / "metrics.json").read_text())["mean"])
+        size = longest + 5 * (words[1:] == [str(longest + 5)])
+        assert (f" of {size}x{size})" in capsys.readouterr().out) == bool(words)
+    assert means[0] == pytest.approx(means[1], rel=2e-3) != pytest.approx(means[2], rel=2e-3)
+    assert "r_0.png has" in failure("eval", run, "--size", "5000")
 
 
 def test_figures_are_written_after_their_picture(run, tmp_path, monkeypatch):

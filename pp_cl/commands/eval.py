@@ -16,6 +16,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("run_folder", metavar="RUN", help="folder of the run")
     shared.add_metrics(parser)
     add("--split", default="test", help="train, val or test (default)")
+    add(
+        "--size",
+        type=shared.integer(16, 2**15),
+        default=0,
+        metavar="N",
+        help="measure on views whose longer side has N pixels, to compare runs of different sizes",
+    )
     shared.add_run_scene(parser)
     add("--out", metavar="FOLDER", help="folder to write to, instead of RUN/eval")
     add("--save-images", action="store_true", help="write every view to RUN/eval/images/")
@@ -31,10 +38,16 @@ def run(options: argparse.Namespace) -> None:
     run = load(options.run_folder, options.device, scene=options.scene)
     metrics, folder = options.metrics, run.folder
     result = evaluate_run(
-        run, options.split, metrics, save_images=options.save_images, out=options.out
+        run,
+        options.split,
+        metrics,
+        save_images=options.save_images,
+        out=options.out,
+        size=options.size,
     )
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
-    own = f"{folder} ({len(result['per_image'])} views{state})"
+    own = f"{folder} ({len(result['per_image'])} views"
+    own += f" of {result['size'][0]}x{result['size'][1]}{state})" if options.size else f"{state})"
     published = {} if result["published_differs"] else result["published"]
     ranked = [(own, result["mean"]), *published.items()]
     if "mean_after_colour" in result:
@@ -49,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
         f"{points['final']} points ({points['initial']} at the start), {share}"
         f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
     )
-    written = Path(options.out or folder.evaluation(options.split))
+    written = Path(options.out or folder.evaluation(options.split, options.size))
     print(
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
         " | truth | 4 x error)"

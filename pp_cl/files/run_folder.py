@@ -54,9 +54,12 @@ class RunFolder:
         """The folder of another member; numbers start at 2."""
         return RunFolder(self.path / f"member-{number}")
 
-    def evaluation(self, split: str) -> Path:
-        """Folder of the evaluation of a split: eval for test, eval/SPLIT for others."""
-        return self.path / "eval" if split == "test" else self.path / "eval" / split
+    def evaluation(self, split: str, size: int = 0) -> Path:
+        """Folder of the evaluation of a split: eval for test, eval/SPLIT for others; within it
+        size-SIZE for views of another size than in the training.
+        """
+        folder = self.path / "eval" if split == "test" else self.path / "eval" / split
+        return folder / f"size-{size}" if size else folder
 
     def metrics(self, split: str) -> Path:
         """The file with the results of a split's evaluation."""
