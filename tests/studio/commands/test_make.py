@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.runs import SETTINGS, spoken
+from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.commands import COMMANDS
@@ -207,9 +208,15 @@ def test_a_scene_that_has_changed_is_trained_anew(tmp_path, monkeypatch):
 
 def test_a_preset_that_others_make_smaller_is_told(capsys):
     assert make._preset(15, 1.0) == "small" and not capsys.readouterr().out
-    assert make._preset(15, 0.2) == "tiny"
+    assert make._preset(3, 0.2) == "tiny"
     line = "other programs take 80% of the processor: the preset is tiny, not small"
     assert line in capsys.readouterr().out
+
+
+def test_images_are_as_large_as_their_minutes_make_sharp(tmp_path):
+    scene = write_ball_scene(tmp_path / "ball", size=1000, views=3)
+    assert make._sized("small", scene) == ["--preset", "small", "--downscale", "2"]
+    assert make._sized("tiny", scene) == ["--preset", "tiny"]
 
 
 def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
@@ -295,7 +302,7 @@ class Enough(Exception):
     "words, preset",
     [
         ([], "small"),
-        (["--minutes", "3"], "tiny"),
+        (["--minutes", "1.5"], "tiny"),
         (["--minutes", "60"], "full"),
         (["--preset", "tiny"], "tiny"),
     ],
@@ -312,6 +319,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
 
     monkeypatch.setattr(make, "_step", step)
     monkeypatch.setattr(make, "_share", lambda: 1.0)
+    monkeypatch.setattr(make, "_sized", lambda preset, scene: ["--preset", preset])
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
     photographs, folder = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
@@ -322,7 +330,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
     scene, out = (str(tmp_path / "out" / name) for name in ("scene", "run"))
     box = "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
-    minutes = {"3": "2", "60": "55"}.get(words[-1] if words else "", "15")
+    minutes = {"1.5": "0.9", "60": "55"}.get(words[-1] if words else "", "15")
     assert steps == [
         ("capture", (str(photographs), "--out", scene, "--turntable", "--masks", "M", box)),
         (
