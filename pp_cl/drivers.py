@@ -327,6 +327,8 @@ def _probe(drivers):
         lines = done.stdout.splitlines()
         if done.returncode == 0:  # drivers may have printed other lines before
             return {"devices": json.loads(lines[-1]), "left_out": left_out}
+        if not tried:  # it is no driver that ends the process
+            return {"devices": [], "left_out": left_out}
         begun = [line.removeprefix(BEGINS) for line in lines if line.startswith(BEGINS)]
         status = done.returncode
         how = signal.Signals(-status).name if status < 0 else f"status {status:#x}"

@@ -109,9 +109,6 @@ def open_scene(
     return scene
 
 
-# Pending images -----------------------------------------------------------------------------------
-
-
 def load_scene(
     path: str | Path,
     splits: Iterable[str] = ("train",),

@@ -133,6 +133,19 @@ def test_what_was_found_is_kept_and_found_anew_where_its_file_is_damaged(
     assert tried(file / "cache") == 9
 
 
+def test_a_process_that_dies_before_any_driver_is_not_started_for_ever(monkeypatch):
+    commands = []
+
+    def dies(command, **_):
+        commands.append(command)
+        return subprocess.CompletedProcess(command, 1, stdout="", stderr="no memory")
+
+    monkeypatch.setattr(drivers.subprocess, "run", dies)
+    found = drivers._probe({"a.icd": "a.so", "b.icd": "b.so"})
+    assert found["devices"] == [] and [*found["left_out"]] == ["a.icd", "b.icd"]
+    assert len(commands) == 2
+
+
 @pytest.mark.parametrize("result", ["wrong", "error"])
 def test_probe_names_the_problem(session_device, monkeypatch, result):
     change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
