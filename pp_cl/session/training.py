@@ -79,8 +79,8 @@ class Training:
     plan. info: what a checkpoint's header holds besides the model's entries. hull: None if it
     resumes. measured: the views on which train.eval_every measures PSNR. seconds: of its steps so
     far. began: time.monotonic() when it was opened, less the time before an interruption;
-    train.minutes count from there. on_preview: called after each preview, if set. clock: of
-    train.minutes, None without.
+    train.minutes count from there. on_preview: called after each preview but the last, if set.
+    clock: of train.minutes, None without.
     """
 
     folder: RunFolder
@@ -243,13 +243,16 @@ class Training:
         due = any(has_passed(n / PREVIEWS, before, trainer.progress) for n in range(1, PREVIEWS))
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
+            if self.on_preview and not last:
+                self.on_preview()
         due = step % train.checkpoint_every == 0 or time.monotonic() >= self._save_by
         if due and not last:
             self._save(finished=False)
         if self.clock and has_passed(MEASURED_AT, before, trainer.progress):
-            start = time.perf_counter()
-            trainer.render(trainer.views[0])
-            looking = time.perf_counter() - start
+            for _ in range(2):  # the first one may build kernels
+                start = time.perf_counter()
+                trainer.render(trainer.views[0])
+                looking = time.perf_counter() - start
             self.clock.reserve(seconds_after(train, len(trainer.views), looking, trainer.steps))
         return row
 
@@ -297,8 +300,6 @@ class Training:
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
         write_comparison(path, [self._rendered(view)], [trainer.target(view)])
-        if self.on_preview:
-            self.on_preview()
 
     def present_run(self) -> Run:
         """The model trained so far as a Run, to be rendered between two steps. It uses the
