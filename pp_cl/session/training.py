@@ -216,6 +216,7 @@ class Training:
         try:
             most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, before)
         except UserError as error:
+            trainer.progress = before  # so that what is due now is due after the resumed step
             self._save(finished=False)
             raise UserError(
                 f"step {step}: to go on with {count} points, {error}, in another --out"

@@ -284,4 +284,6 @@ def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_lear
     assert "step 20: to go on with " in error and error.endswith("in another --out")
     plain.info["memory_bytes"] = GIB
     assert main(words) == 0
-    assert "resuming at step 19 " in capsys.readouterr().out
+    assert "resuming at step 20 " in capsys.readouterr().out
+    points = {row["step"]: row["points"] for row in RunFolder(tmp_path / "run").rows()}
+    assert points[25] == 8 * points[15]  # it is refined after the step that it resumes with

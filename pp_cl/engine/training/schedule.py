@@ -95,7 +95,7 @@ def refinements(train: TrainConfig) -> list[float]:
     shares = sorted({share for share in train.refine_at if 0 < share < 1})
     kept = shares[:1]
     for share in shares[1:]:
-        between = (math.ceil(at * train.iterations) for at in (kept[-1], share))
+        between = (round(at * train.iterations) for at in (kept[-1], share))
         if train.minutes or train.prune_weight == 0 or prunings(train, *between):
             kept.append(share)
     return kept
@@ -143,8 +143,11 @@ def expected_stretches(train: TrainConfig, points: int, progress: float) -> Iter
             yield Stretch(points, to_come, is_averaged, supersampling_at(now, train))
             first = max(at for at in stages if at <= start)
             last = min(at for at in stages if at >= end)
-            steps = (math.ceil(at * train.iterations) for at in (first, last))
-            pruned = (end - now) / (last - first) if prunings(train, *steps) else 0.0
+            to_end, of_stage = (
+                prunings(train, *(round(at * train.iterations) for at in shares))
+                for shares in ((now, end), (first, last))
+            )
+            pruned = to_end / max(1, of_stage)
             points = round(points * LEFT_BY_PRUNING**pruned) * (8 if end in refined else 1)
         start = end
 
