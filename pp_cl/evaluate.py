@@ -82,8 +82,7 @@ def evaluate_run(
     points = {"initial": header["initial_points"], "final": run.model.cloud.count}
     published = published_rows(here.name, cameras)
     differs = differences(here.name, cameras, views[0].file_downscale, split) if published else ""
-    if published and size:
-        differs = f"here: images of {size} pixels"
+    differs = f"here: images of {size} pixels" if published and size else differs
     width, height = max((view.camera.width, view.camera.height) for view in views)
     result |= {
         "size": [width, height],

@@ -121,8 +121,8 @@ class View:
         return replace(self, downscale=fitting_downscale(size, side))
 
     def of_size(self, side: int) -> "View":
-        """The image with a longer side of `side` pixels, each the mean by area of what it covers of
-        the reduced image, which must be as large. Ignored are those that cover an ignored one.
+        """The image with a longer side of `side` pixels, at most as many as the reduced image has;
+        each is the mean by area of stored pixels, and ignored if it covers an ignored one.
         """
         from skimage.transform import resize_local_mean
 
@@ -130,18 +130,15 @@ class View:
         scale = side / max(camera.width, camera.height)
         width, height = (max(1, round(scale * n)) for n in (camera.width, camera.height))
 
-        def resized(image):
-            return resize_local_mean(image, (height, width), channel_axis=-1, preserve_range=True)
+        def resized(stored):
+            used = stored[: k * camera.height, : k * camera.width].astype(np.float32)
+            if used.ndim == 3:
+                used[..., :3] *= used[..., 3:]
+            return resize_local_mean(used, (height, width, *used.shape[2:]), preserve_range=True)
 
-        straight = self.image.astype(np.float32)
-        straight[..., :3] *= straight[..., 3:]
-        blocks = straight[: k * camera.height, : k * camera.width]
-        blocks = blocks.reshape(camera.height, k, camera.width, k, 4).mean((1, 3))
-        image = resized(blocks)
+        image = resized(self.image)
         image[..., :3] /= np.maximum(image[..., 3:], 1 / 255)
-        ignored = self.ignored_crop((0, 0, camera.width, camera.height))
-        if ignored is not None:
-            ignored = resized(ignored[..., None].astype(np.float32))[..., 0] > 0
+        ignored = None if self.ignored is None else resized(self.ignored) > 0
         return replace(
             self,
             stored_camera=camera.stretched(width, height),
