@@ -299,6 +299,7 @@ class Enough(Exception):
     """Raised to end the command once the test knows its steps."""
 
 
+@pytest.mark.usefixtures("minutes")  # a busy machine takes none of them
 @pytest.mark.parametrize(
     "words, preset",
     [
