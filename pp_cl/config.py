@@ -178,7 +178,7 @@ def begin_with(path: Path | str, given: list[Given]) -> tuple[str, list[Given]]:
     length = "train.minutes" if config.train.minutes else "train.iterations"
     asked = {key for key, _, _ in given}
     left_out = set(LENGTH) if asked & set(LENGTH) else set(LENGTH) - {length}
-    left_out |= {*config.automatic}
+    left_out |= {*AUTOMATIC} & {*config.decisions}
     settings = [
         (key, getattr(section, item.name), f"--config {path}")
         for key, section, item in every_setting(config)
@@ -204,7 +204,8 @@ def load_config(path: Path | str) -> Config:
     if not isinstance(stored, dict):
         raise broken(f"not settings but {quoted(stored, 40)}")
     number, name = stored.pop("format", None), stored.pop("preset", None)
-    automatic = stored.pop("automatic", [])
+    before = stored.pop("automatic", [])  # of 0.4.0: a list of keys
+    decisions = stored.pop("decisions", {str(key): "decided by 0.4.0" for key in before})
     if type(number) is not int or number != FORMAT:
         raise UserError(
             f"{path}: format is {quoted(number, 40)}, but this version reads {FORMAT}; start a new"
@@ -212,14 +213,17 @@ def load_config(path: Path | str) -> Config:
         )
     if type(name) is not str or name not in PRESETS:
         raise broken(f"key preset is missing or not one of {', '.join(PRESETS)}")
-    if not isinstance(automatic, list) or not all(key in AUTOMATIC for key in automatic):
-        raise broken(f"automatic is {quoted(automatic, 40)}, not a list of {', '.join(AUTOMATIC)}")
+    known = [key for key, _, _ in every_setting(Config())]
+    if not isinstance(decisions, dict) or not all(
+        key in known and isinstance(why, str) for key, why in decisions.items()
+    ):
+        raise broken(f"decisions are {quoted(decisions, 40)}, not settings with reasons")
     by_key: dict[str, Any] = {}
     for section, values in stored.items():
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is not a section of settings")
         by_key |= {f"{section}.{key}": value for key, value in values.items()}
-    config, by_key = Config(name, automatic), ADDED | by_key
+    config, by_key = Config(name, decisions), ADDED | by_key
     for key, section, item in every_setting(config):
         if key not in by_key:
             raise broken(f"{key} is missing")
@@ -303,9 +307,10 @@ def run_config(
     if not stored or other_preset:
         return scene_config(scene, preset_name or "tiny", given)
     # the training was stopped before its first checkpoint: automatic settings are chosen again
-    for key in stored.automatic:
-        assign(stored, key, field_of(key).default, "preset")
-    stored.automatic = []
+    for key in [key for key in stored.decisions if key != "scene.downscale"]:
+        if key in AUTOMATIC:
+            assign(stored, key, field_of(key).default, "preset")
+        del stored.decisions[key]
     if "train.iterations" in [key for key, _, _ in given]:
         stored.train.minutes = 0.0
     return configure(stored, scene, given)
@@ -328,6 +333,10 @@ def scene_config(scene: str, preset_name: str, given: Iterable[Given] = ()) -> C
         fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset_name])
         most = max(1, min(map(min, sizes)) // MIN_SIDE)
         assign(config, "scene.downscale", min(fitting, most), "preset")
+        why = f"for the preset {preset_name} (--downscale 1 keeps them)"
+        config.decisions["scene.downscale"] = (
+            f"size: images reduced {min(fitting, most)} times {why}"
+        )
     return config
 
 
@@ -347,7 +356,7 @@ def _resumed(folder, stored, scene, given):
     for key, section, item in every_setting(config):
         there = getattr(getattr(stored, key.partition(".")[0]), item.name)
         asked = getattr(section, item.name)
-        if key in stored.automatic and asked == item.default:
+        if key in AUTOMATIC and key in stored.decisions and asked == item.default:
             setattr(section, item.name, there)  # what the training has chosen
         elif asked != there and key not in free:
             refuse_setting(folder, key, there, asked)

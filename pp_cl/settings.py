@@ -30,8 +30,8 @@ class SceneConfig:
     """The photographs."""
 
     path: str = setting("", "folder of the scene, or the word demo")
-    downscale: int = setting(
-        1, "reduce the images this many times (if not given: to about the preset's size)", 1, 64
+    downscale: float = setting(
+        1.0, "reduce the images this many times (if not given: to about the preset's size)", 1, 64
     )
     mask_from: str = setting(
         "given",
@@ -257,10 +257,10 @@ class TrainConfig:
 
 @dataclass
 class Config:
-    """All settings of a run. automatic: those of AUTOMATIC that the training chose itself."""
+    """All settings of a run. decisions: {section.key: reason} of what the training decided."""
 
     preset: str = "tiny"
-    automatic: list[str] = field(default_factory=list)
+    decisions: dict[str, str] = field(default_factory=dict)
     scene: SceneConfig = field(default_factory=SceneConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
@@ -268,8 +268,8 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def to_json(self) -> str:
-        """The settings as JSON text: {"format": FORMAT, "preset": name, "automatic": keys,
-        section: {name: value}}.
+        """The settings as JSON text: {"format": FORMAT, "preset": name, "decisions":
+        {key: reason}, section: {name: value}}.
         """
         return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
 

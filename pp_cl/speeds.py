@@ -65,6 +65,11 @@ def _is_intels(device):
     return not is_gpu(device) and device.platform.name.startswith(INTEL_PLATFORM)
 
 
+def speed_of(device: cl.Device) -> float:
+    """A device's speed as in kept_speeds(); 0 if it is not known."""
+    return kept_speeds([device]).get(_key(device), 0.0)
+
+
 def kept_speeds(devices: Sequence[cl.Device]) -> dict[str, float]:
     """{"platform, name, version": GFLOP/s} from the user's cache, {} without one. If it lacks a
     device, all devices are measured, once for all processes that ask in the meantime.

@@ -15,7 +15,7 @@ from pp_cl.scene.hull import build_grid
 from pp_cl.scene.listing import scene_frames
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.transforms import write_scene
-from pp_cl.session.memory import MemoryPlan
+from pp_cl.session.memory import Memory, Place
 
 SIZES = ((48, 48), (37, 29), (24, 40))
 
@@ -86,6 +86,7 @@ def test_memory_is_planned_for_the_largest(dev, scene):
     frames = scene_frames(scene)
     orders = frames, frames[::-1], [max(frames, key=lambda view: view.camera.width)] * len(frames)
     mixed, turned, largest = (
-        MemoryPlan(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
+        Memory(config, net, order).need(config, Place(hull.grid, len(hull.ids), (2, 6)))
+        for order in orders
     )
     assert mixed == turned and 0.9 * largest.device < mixed.device <= largest.device

@@ -16,7 +16,7 @@ from pp_cl.engine.layers.tiles import SIDE
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.scene.verdict import judged
-from pp_cl.session.start import first_hull
+from pp_cl.session.decide import first_hull
 
 BOX, HULL, POINT = (0.93, 0.93, 0.93), (0.55, 0.75, 0.95), (0.85, 0.35, 0.1)
 BESIDE = 0.35  # brightness of tiles that are not computed

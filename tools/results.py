@@ -175,12 +175,6 @@ TABLES = {
         "medians of a step on lego ({steps})",
         " | ".join(["stage = {stage}", *(f"{name}, ms = {{ms_{name}:.2f}}" for name in STEPS)]),
     ),
-    "memory": (
-        "the most memory that a few steps take",
-        "training = {name} | points at the peak = {points:,}"
-        " | device: plan = {device_plan:.0f} MiB | measured = {device:.0f} MiB"
-        " | host: plan = {host_plan:.0f} MiB | measured = {host:.0f} MiB",
-    ),
     "demo": ("runs of the demo", "measured on = {what} | result = {result}"),
     "meshes": (
         "meshes as exported; roughness is the mean angle of neighbouring faces, distances are in"
@@ -316,11 +310,6 @@ def by_preset(found: dict[str, dict]) -> list[dict]:
     return list(rows.values())
 
 
-def memory(store: Path) -> list[dict]:
-    """Rows of memory."""
-    return read_found(store, *TOOL, "tools.memory_peaks")
-
-
 def demo(store: Path) -> list[dict]:
     """Rows of demo: errors of depth and alpha of the demo's runs."""
     rows = []
@@ -401,7 +390,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in (*TRAININGS, *CURVES)},
     **{part.__name__: part for part in (demo, rasteriser, pytorch)},
     **{f"stages_{preset}": partial(stages, preset) for preset in STEPS},
-    **{part.__name__: part for part in (memory, meshes, splats, stability, work, frontier)},
+    **{part.__name__: part for part in (meshes, splats, stability, work, frontier)},
 }
 
 

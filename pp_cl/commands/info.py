@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _run_rows(facts):
     state = "finished" if facts["finished"] else "not finished"
-    reduced = f", images reduced {facts['downscale']} times" * (facts["downscale"] > 1)
+    reduced = f", images reduced {facts['downscale']:g} times" * (facts["downscale"] > 1)
     needing = "train, eval, compare and render --path test or val"
     gone = "" if facts["scene_is_there"] else f" (not there; {needing} need it)"
     rows = [
@@ -93,6 +93,8 @@ def _run_rows(facts):
         rows.append(("", f"{facts['seconds']:.1f} s{where}"))
     if facts["psnr"] is not None:
         rows.append(("", f"PSNR {facts['psnr']:.2f} in the last logged step"))
+    rows += [("decisions", why) for why in facts["decisions"].values()][:1]
+    rows += [("", why) for why in facts["decisions"].values()][1:]
     network = facts["network"]
     widths = ", ".join(map(str, network["widths"]))
     shape = f"{widths} channels, {network['blocks']} blocks"
@@ -167,8 +169,8 @@ def _scene_rows(facts):
         *(("", note) for note in facts["notes"]),
         (
             "images",
-            f"{_sizes(facts['images'])}; preset {facts['preset']}: reduced {facts['downscale']}"
-            " times",
+            f"{_sizes(facts['images'])}; preset {facts['preset']}: reduced"
+            f" {facts['downscale']:g} times",
         ),
         ("focal", f"{_range(facts['focal_pixels'], '.1f')} pixels"),
         ("view", f"{angle_x} x {angle_y} degrees"),

@@ -30,7 +30,7 @@ from pp_cl.scene.listing import DEMO, scene_box, scene_format, scene_frames, sce
 from pp_cl.scene.load import open_scene
 from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
 from pp_cl.scene.verdict import WrongCameras, judged
-from pp_cl.session.start import first_hull
+from pp_cl.session.decide import first_hull
 
 WORK_VIEWS = 8  # number of views in which run_work() counts
 
@@ -50,6 +50,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "scene_is_there": scene_is_there(config.scene.path),
         "views": None,
         "downscale": config.scene.downscale,
+        "decisions": config.decisions,
         "iterations": config.train.iterations,
         "network": {"widths": list(network.widths), "blocks": network.blocks, "parameters": None},
         "step": 0,

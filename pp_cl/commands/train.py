@@ -29,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--preset",
         choices=PRESETS,
-        help="tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and"
-        " full: of up to 1600, made for 800, longer; best: the mean of two such; paper: the"
-        " paper's numbers",
+        help="tiny: images of about 200 pixels, minutes on a CPU; small: of 400, and full: of up to"
+        " 1600, made for 800, longer; best: the mean of two such; paper: the paper's numbers (if"
+        " neither this nor --iterations is given: by --minutes, 10, and the device; else tiny)",
     )
     add(
         "--config",
@@ -54,8 +54,8 @@ def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lamb
     """Train, or say that there is nothing left to train. follow: called with each training before
     its first step.
     """
-    from pp_cl.config import run_config
     from pp_cl.files.run_folder import RunFolder
+    from pp_cl.session.decide import config_of
     from pp_cl.session.training import members
 
     if options.view:
@@ -72,19 +72,17 @@ def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lamb
     if options.scene is None and is_new:
         raise UserError("SCENE: name the folder of a scene, or the word demo")
     scene = options.scene or load_config(folder.config).scene.path
-    config = run_config(folder, scene, preset, given)
-    chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
+    config = config_of(folder, scene, preset, given, options.device)
     for member_folder, member_config in members(folder, config):
         if member_folder is not folder:
             print(f"a training with the next seed, in {member_folder}")
-        _train(member_folder, member_config, options, chosen, follow)
+        _train(member_folder, member_config, options, follow)
 
 
-def _train(folder, config, options, chosen, follow):
-    """Train one run. chosen: whether the preset chose the images' size."""
+def _train(folder, config, options, follow):
+    """Train one run."""
     from pp_cl.drivers import device_line, open_device
     from pp_cl.engine.training.schedule import refinements
-    from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
 
     stored = stored_state(folder, config)
@@ -99,8 +97,8 @@ def _train(folder, config, options, chosen, follow):
     training = open_training(dev, folder, config, stored)
     follow(training)
     train = training.config.train
-    print(_images_line(training, chosen))
-    print(_first_line(training))
+    print(_images_line(training))
+    print(*_first_lines(training), sep="\n")
     if begun := training.trainer.begun:
         print(
             f"extends a finished training of {begun} steps; {train.iterations} from the"
@@ -113,7 +111,7 @@ def _train(folder, config, options, chosen, follow):
             f"refinements: {made} of the {wanted} of train.refine_at, since in"
             f" {train.iterations} iterations nothing is pruned between them"
         )
-    print(memory_line(training.memory_plan), flush=True)
+    print(training.memory_line(), flush=True)
     seconds = _run(training, options)
     if fitted := training.trainer.fitted:
         print(_specular_line(fitted))
@@ -125,34 +123,16 @@ def _train(folder, config, options, chosen, follow):
     )
 
 
-def _first_line(training):
-    """A line of text: the points that the training starts from, or the step it resumes at."""
-    from pp_cl.scene.hull import CELL_CAP, spacing_pixels
-
+def _first_lines(training):
+    """Lines of text: what a new training has decided, or the step that another resumes at."""
     hull, trainer = training.hull, training.trainer
-    points = trainer.model.cloud.count
     if hull is None:
-        return f"resuming at step {trainer.step} with {points} points"
-    spacing = spacing_pixels(trainer.model.grid, [view.camera for view in trainer.views])
-    times = range(1, trainer.refinements_to_come + 1)
-    finer = "".join(f", later {spacing / 2**n:.2f}" for n in times)
-    line = (
-        f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
-        f" the object ({hull.seconds:.1f} s)"
+        return [f"resuming at step {trainer.step} with {trainer.model.cloud.count} points"]
+    of_masks = (
+        f"masks: they contradict each other; up to {hull.forgiven} of {len(trainer.views)} may"
+        " reject a point"
     )
-    if hull.forgiven:
-        line += (
-            f"\nmasks: they contradict each other; up to {hull.forgiven} of {len(trainer.views)}"
-            " may reject a point"
-        )
-    if hull.given_up:
-        line += f"\n{hull.given_up}"
-    if hull.capped:
-        line += (
-            f"\npoints: only {points} of the {training.config.points.count} asked for, since a"
-            f" finer grid would have more than {CELL_CAP} cells"
-        )
-    return line
+    return [*training.config.decisions.values(), *[of_masks] * (hull.forgiven > 0)]
 
 
 def _specular_line(fitted):
@@ -166,15 +146,12 @@ def _specular_line(fitted):
     )
 
 
-def _images_line(training, chosen):
-    """A line of text: the size of the images. chosen: whether the preset chose the downscale."""
+def _images_line(training):
+    """A line of text: the size of the images."""
     views = training.trainer.views
-    view, stored = views[0], _sizes([view.file_camera for view in views])
+    stored = _sizes([view.file_camera for view in views])
     used = _sizes([view.camera for view in views])
-    if view.file_downscale == 1:
-        return f"images: {stored}"
-    why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    return f"images: scaled from {stored} to {used}{why}"
+    return f"images: {stored}" if stored == used else f"images: scaled from {stored} to {used}"
 
 
 def _sizes(cameras):

@@ -9,7 +9,7 @@ camera, grid, views: define Camera, Grid and View.
 raster/: points, project, pairs, weights, blend, depth: a module for each stage.
 network/: layers is the U-Net on one page; unet launches it; tile_plan skips background.
 layers/: the convolutions and the small layers; choice selects one for each layer.
-training/: target, crops, loss, exposure; optim, state, schedule; smooth, prune; needs.
+training/: target, crops, loss, exposure; optim, state, schedule; smooth, prune.
 device/: device and kernel build and launch kernels by name; buffers, launch, scan, host.
 """
 

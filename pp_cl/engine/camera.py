@@ -8,6 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
+def divided(factor: float) -> tuple[int, float]:
+    """(k, ratio): images that are reduced `factor` times are resampled by the ratio, from 1 to 2,
+    and then reduced k times, the largest whole number up to the factor.
+    """
+    whole = math.floor(factor)
+    return whole, factor / whole
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward.
@@ -103,10 +111,15 @@ class Camera:
         """The camera whose pixels lie (dx, dy) pixels further right and down."""
         return replace(self, cx=self.cx - dx, cy=self.cy - dy)
 
-    def downscaled(self, factor: int) -> "Camera":
+    def downscaled(self, factor: float) -> "Camera":
         """The camera of the image whose pixels are means of factor x factor pixels; columns and
-        rows that fill no block are cut off.
+        rows that fill no block are cut off. Another factor than a whole number: of the image that
+        is resampled first, as divided() says.
         """
+        factor, ratio = divided(factor)
+        if ratio > 1:
+            size = int(self.width / ratio), int(self.height / ratio)
+            return self.stretched(*size).downscaled(factor)
         return replace(
             self,
             fx=self.fx / factor,

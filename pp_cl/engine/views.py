@@ -1,5 +1,6 @@
 """Views: images with their cameras, listed by a scene, loaded, and reduced."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,7 +34,7 @@ class View:
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
     None for an image that the program made itself. shrunk: how many times the stored image was
-    reduced while it was read from its file (shrink()). unshrunk_camera: camera of the file's image,
+    reduced while it was read from its file. unshrunk_camera: camera of the file's image,
     if it differs. is_masked: the image has a mask, even if the object fills it. ignored: (H, W)
     bool, True for pixels that neither the hull nor the loss uses; the image is 0 there. None: no
     such pixels.
@@ -45,7 +46,7 @@ class View:
     depth_range: tuple[float, float] | None = None
     downscale: int = 1
     digest: str | None = None
-    shrunk: int = 1
+    shrunk: float = 1
     unshrunk_camera: Camera | None = None
     is_masked: bool = False
     ignored: np.ndarray | None = None
@@ -56,7 +57,7 @@ class View:
         return self.unshrunk_camera or self.stored_camera
 
     @property
-    def file_downscale(self) -> int:
+    def file_downscale(self) -> float:
         """How many times the image in its file is reduced in total."""
         return self.shrunk * self.downscale
 
@@ -111,7 +112,7 @@ class View:
         Raises UserError unless downscale is a whole number that leaves at least MIN_SIDE pixels
         each way.
         """
-        asked = downscale * self.shrunk if isinstance(downscale, int) else downscale
+        asked = downscale * self.shrunk if isinstance(downscale, int) else math.nan
         check_downscale(self.name, self.file_camera, asked)
         return replace(self, downscale=downscale)
 
@@ -121,14 +122,20 @@ class View:
         return replace(self, downscale=fitting_downscale(size, side))
 
     def of_size(self, side: int) -> "View":
-        """The image with a longer side of `side` pixels, at most as many as the reduced image has;
-        each is the mean by area of stored pixels, and ignored if it covers an ignored one.
+        """The image with a longer side of `side` pixels, at most as many as the reduced image has,
+        as resampled() makes it.
+        """
+        scale = side / max(self.camera.width, self.camera.height)
+        size = (max(1, round(scale * n)) for n in (self.camera.width, self.camera.height))
+        return self.resampled(*size)
+
+    def resampled(self, width: int, height: int) -> "View":
+        """The image of width x height pixels, at most as many as the reduced image has; each is the
+        mean by area of stored pixels, and ignored if it covers an ignored one.
         """
         from skimage.transform import resize_local_mean
 
         camera, k = self.camera, self.downscale
-        scale = side / max(camera.width, camera.height)
-        width, height = (max(1, round(scale * n)) for n in (camera.width, camera.height))
 
         def resized(stored):
             used = stored[: k * camera.height, : k * camera.width].astype(np.float32)
@@ -144,6 +151,7 @@ class View:
             stored_camera=camera.stretched(width, height),
             image=np.rint(image).astype(np.uint8),
             downscale=1,
+            shrunk=self.file_downscale * camera.width / width,
             unshrunk_camera=self.file_camera,
             ignored=ignored,
         )
@@ -173,9 +181,9 @@ class View:
         return x0, y0, x1, y1
 
 
-def check_downscale(name: str, camera: Camera, downscale: int) -> None:
+def check_downscale(name: str, camera: Camera, downscale: float) -> None:
     """Raise UserError unless the image `name` of a camera can be reduced `downscale` times: a
-    whole number that leaves at least MIN_SIDE pixels each way.
+    number that leaves at least MIN_SIDE pixels each way.
     """
     width, height = camera.width, camera.height
     most = min(width, height) // MIN_SIDE
@@ -183,10 +191,10 @@ def check_downscale(name: str, camera: Camera, downscale: int) -> None:
         raise UserError(
             f"{name}: {width}x{height} pixels; at least {MIN_SIDE}x{MIN_SIDE} are needed"
         )
-    if not isinstance(downscale, int) or not 1 <= downscale <= most:
+    if not 1 <= downscale <= most:
         raise UserError(
-            f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
-            f"{width}x{height} pixels of {name}"
+            f"--downscale {downscale:g}: not a number from 1 to {most}, the range for the"
+            f" {width}x{height} pixels of {name}"
         )
 
 

@@ -48,18 +48,18 @@ def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict
 
 
 def differences(
-    scene_name: str, cameras: Sequence[Camera], downscale: int, split: str = "test"
+    scene_name: str, cameras: Sequence[Camera], downscale: float, split: str = "test"
 ) -> str:
     """How a measurement of a published scene differs from the published measurements; "" if it does
     not. cameras: cameras of the measured views' stored images.
     """
     if scene_name in CO3D_SEQUENCES:
         conditions = [f"split {split}"] * (split != "test")
-        conditions += [f"images reduced {downscale} times"] * (downscale > 1)
+        conditions += [f"images reduced {downscale:g} times"] * (downscale > 1)
         return f"here: {', '.join(conditions)}" if conditions else ""
     views = "{} {} views of {}x{} pixels".format
     published = views(SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE, SYNTHETIC_SIZE)
-    here = views(len(cameras), split, *[SYNTHETIC_SIZE // downscale] * 2)
+    here = views(len(cameras), split, *[int(SYNTHETIC_SIZE / downscale)] * 2)
     return "" if here == published else f"published: {published}; here: {here}"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.camera import divided
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, border, check_downscale, evenly
 from pp_cl.errors import Unusable, UserError
@@ -81,7 +82,9 @@ def open_scene(
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
-        return Scene(DEMO, None, _reduced(rendered, downscale))
+        whole, ratio = divided(downscale)
+        fitted = {s: [_resampled(view, ratio) for view in views] for s, views in rendered.items()}
+        return Scene(DEMO, None, _reduced(fitted, whole))
     scene = load_scene(
         path, splits, most, config.scene, downscale=downscale, listed=listed, dev=dev
     )
@@ -116,7 +119,7 @@ def load_scene(
     masks: SceneConfig = AS_GIVEN,
     *,
     dev: Device | None = None,
-    downscale: int | None = None,
+    downscale: float | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
     """The Scene in a folder with the given splits. most: views to read of each split, spread
@@ -149,9 +152,10 @@ def load_scene(
     image_files = [image for files in chosen.values() for image in files]
     if dev is None and any(image.lens for image in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
-    factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], downscale or 1)
+    whole, ratio = divided(downscale or 1)
+    factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], whole)
     views = {
-        split: _read_views(folder, files, masks, dev, factor, left_out[split])
+        split: _read_views(folder, files, masks, dev, (factor, ratio), left_out[split])
         for split, files in chosen.items()
     }
     has_masks = any(v.is_masked or v.has_mask for of_split in views.values() for v in of_split)
@@ -162,12 +166,18 @@ def load_scene(
         check_left(views[split], gone, LEAST_VIEWS if is_whole else 1)
         lines += split_lines(split, views[split], gone, done)
     tell(folder, lines)
-    views = _reduced(views, downscale // factor) if downscale else views
+    views = _reduced(views, whole // factor) if downscale else views
     return Scene(folder.resolve().name, folder, views, lines)
 
 
 def _reduced(splits, downscale):
     return {split: [view.reduced(downscale) for view in views] for split, views in splits.items()}
+
+
+def _resampled(view, ratio):
+    """The view with an image of fewer pixels, by a ratio."""
+    width, height = view.stored_camera.width, view.stored_camera.height
+    return view.resampled(int(width / ratio), int(height / ratio)) if ratio > 1 else view
 
 
 def _as_masks_fit(folder, image_files):
@@ -197,12 +207,15 @@ def _as_masks_fit(folder, image_files):
     return image_files, [(file.name, TURNED if file.name in turned else STORED) for file in asked]
 
 
-def _read_views(folder, image_files, masks, dev, factor, left_out):
-    """The views of the usable images, several read at a time; the others go to left_out."""
+def _read_views(folder, image_files, masks, dev, factors, left_out):
+    """The views of the usable images, several read at a time, reduced a whole number of times and
+    then resampled by a ratio; the others go to left_out.
+    """
+    factor, ratio = factors
 
     def read(image_file):
         try:
-            return read_view(folder, image_file, masks, dev, factor)
+            return _resampled(read_view(folder, image_file, masks, dev, factor), ratio)
         except UserError as error:
             return error
 

@@ -146,15 +146,23 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
             image_file.name: image_file.camera
             for image_file in read_as(files, reading, stated, Path(path))
         }
-        tried = [
-            replace(view, stored_camera=cameras[view.name].downscaled(view.shrunk))
-            for view in small
-        ]
+        tried = [replace(view, stored_camera=_reduced(cameras[view.name], view)) for view in small]
         # a reading that does not apply to these files leaves the cameras as stated
         if ahead([view.camera for view in tried]) and not _alike(tried, small):
             share = _beside(dev, tried, forgiven)
             best, least = (reading, share) if share < least else (best, least)
     return best
+
+
+def _reduced(camera, view):
+    """A camera of a view's file, for its stored image."""
+    across, down = (
+        view.stored_camera.fx / view.file_camera.fx,
+        view.stored_camera.fy / view.file_camera.fy,
+    )
+    focal = {"fx": across * camera.fx, "fy": down * camera.fy}
+    size = {"width": view.stored_camera.width, "height": view.stored_camera.height}
+    return replace(camera, cx=across * camera.cx, cy=down * camera.cy, **focal, **size)
 
 
 def _small(views):
@@ -167,7 +175,7 @@ def _small(views):
         if ignored is not None:
             ignored = ignored[: k * camera.height : k, : k * camera.width : k]
         image = shrink(view.image, k)
-        changed = {"image": image, "ignored": ignored, "downscale": 1, "shrunk": k * view.shrunk}
+        changed = {"image": image, "ignored": ignored, "downscale": 1}
         small.append(
             replace(view, stored_camera=camera, unshrunk_camera=view.file_camera, **changed)
         )

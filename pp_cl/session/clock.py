@@ -11,11 +11,6 @@ from pp_cl.settings import TrainConfig
 # the others, and the schedules do not move on in their time.
 BUILDING = 2
 FEWEST, RECENT = 10, 100  # steps of a training at least; last steps whose median time counts
-# A refinement makes a step 2 to 3 times as long. It pays if this many steps would fit without it
-# into the time that is left, for the first one and for the second: in 250 steps of `small`, lego
-# reaches 27.4 dB with its refinement and 29.8 without, in 800 steps 31.5 and 32.3, in 1,160 steps
-# 33.1 and 32.7; in 3,000 steps of `full` 34.4 with two and 35.0 with one, in 7,500 as much.
-PAYS_FROM = 1500, 8500
 RESERVED = 0.08  # share of the minutes for what follows the last step, until it is measured
 MEASURED_AT = 0.8  # progress at which it is
 # What follows looks at all views: once without a network, which takes LOOKING of an image's time,
@@ -60,11 +55,10 @@ class Clock:
         self._times.clear()
         self._skipped = BUILDING
 
-    def pays_to_refine(self, made: int) -> bool:
-        """Whether the time left suffices for a refinement after `made` others, by what a step takes
-        now.
-        """
-        return self._left >= PAYS_FROM[min(made, 1)] * statistics.median(self._times or [0.0])
+    @property
+    def steps_left(self) -> float:
+        """How many steps are left if they take as long as the last ones."""
+        return self._left / max(statistics.median(self._times or [0.0]), 1e-9)
 
     def __call__(self, step: int) -> float:
         """The progress after this many steps."""
@@ -78,7 +72,7 @@ class Clock:
             self.progress += (1 - self.progress) * took / left
         else:
             self.progress = 1.0
-        self.steps = step + max(1.0, self._left / statistics.median(self._times))
+        self.steps = step + max(1.0, self.steps_left)
         if step < FEWEST:  # however little time there is, every schedule is passed
             self.progress = min(self.progress, step / FEWEST)
         return self.progress

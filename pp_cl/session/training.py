@@ -17,7 +17,7 @@ from pp_cl.checkpoint import (
     progress_of,
     save_checkpoint,
 )
-from pp_cl.config import configure, load_config, refuse_setting, run_config
+from pp_cl.config import configure, load_config, refuse_setting
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
@@ -32,8 +32,7 @@ from pp_cl.engine.stored import (
     restore_training,
     training_arrays,
 )
-from pp_cl.engine.training.between import keep_most_visible
-from pp_cl.engine.training.schedule import has_passed, supersampling_at
+from pp_cl.engine.training.schedule import has_passed
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_room, check_target
@@ -48,9 +47,9 @@ from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.listing import list_split, measured_split
 from pp_cl.scene.load import open_scene
 from pp_cl.session.clock import MEASURED_AT, Clock, seconds_after
-from pp_cl.session.memory import MemoryPlan
-from pp_cl.session.plan import NEVER, Plan
-from pp_cl.session.start import begin_network, fitting_hull, sheet_of_masks
+from pp_cl.session.decide import as_decided, config_of, decide, decide_growth, followed, least
+from pp_cl.session.memory import Memory, Place
+from pp_cl.session.start import begin_network, sheet_of_masks
 from pp_cl.settings import Config
 
 PREVIEWS = 4  # that a training writes, besides an early one
@@ -61,22 +60,19 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """Facts about a new training's hull. capped: it has fewer points than asked for. seconds: time
-    of carving. forgiven: how many masks may reject a point. given_up: lines on what lack of memory
-    prevents, or "". sheet: an image of the masks that disagree with the others, None if all agree.
+    """Facts about a new training's hull. seconds: time of carving. forgiven: how many masks may
+    reject a point. sheet: an image of the masks that disagree with the others, None if all agree.
     """
 
-    capped: bool
     seconds: float
     forgiven: int
-    given_up: str
     sheet: np.ndarray | None
 
 
 @dataclass
 class Training:
     """A training that is ready to begin or to go on. config: its settings, which change with its
-    plan. info: what a checkpoint's header holds besides the model's entries. hull: None if it
+    decisions. info: what a checkpoint's header holds besides the model's entries. hull: None if it
     resumes. measured: the views on which train.eval_every measures PSNR. seconds: of its steps so
     far. began: time.monotonic() when it was opened, less the time before an interruption;
     train.minutes count from there. on_preview: called after each preview but the last, if set.
@@ -87,7 +83,7 @@ class Training:
     config: Config
     trainer: Trainer
     info: dict[str, Any]
-    memory_plan: MemoryPlan
+    memory: Memory
     hull: HullFacts | None
     measured: list[View]
     seconds: float
@@ -103,6 +99,17 @@ class Training:
         """Seconds of train.minutes that have passed, including those before an interruption."""
         return time.monotonic() - self.began
 
+    @property
+    def place(self) -> Place:
+        """The points at present."""
+        model = self.trainer.model
+        return Place(model.grid, model.cloud.count, model.depth_range)
+
+    def memory_line(self) -> str:
+        """The memory that the training takes at most from now on, as text."""
+        config = followed(self.config, self.trainer.begun)
+        return self.memory.line(self.memory.need(config, self.place, self.trainer.progress))
+
     def run(
         self,
         on_step: OnStep | None = None,
@@ -111,8 +118,8 @@ class Training:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
         including those before an interruption. on_step(step, row) is called after each step; row is
         the step's row of the log, or None. If is_stopped() is true then, a checkpoint is written
-        and the training ends. Raises UserError if another process trains into the folder, if the
-        next step needs more memory than there is, and if numbers are no longer finite; the last
+        and the training ends. Raises UserError if another process trains into the folder, and
+        if numbers are no longer finite; the last
         checkpoint is kept.
         """
         with self.folder.owned():
@@ -186,48 +193,28 @@ class Training:
         self.trainer.steps = self.clock.steps
         return progress
 
-    def _follow(self, plan):
-        """Go on with another plan, and store it in config.json."""
-        self.config = plan.settings(self.config)
-        for follower in (self.memory_plan, self.trainer):
-            follower.follow(_followed(self.config, self.trainer.begun))
-        self.folder.configure(self.config.to_json())
-
     def _make_room(self, before):
-        """Before more memory is taken: leave out a refinement for which time is too short; for lack
-        of memory give up supersampling that has not begun, and if that is not enough, drop points.
-        before: the progress before the last step.
+        """Before more memory is taken: decide what to give up for lack of it, or of time, and store
+        that in config.json. before: the progress before the last step.
         """
-        trainer, model, train = self.trainer, self.trainer.model, self.config.train
-        count, step = model.cloud.count, trainer.step
-        due = [at for at in trainer.refine_at if has_passed(at, before, trainer.progress)]
+        trainer, steps_left = self.trainer, self.clock.steps_left if self.clock else None
+        config, given_up = decide_growth(
+            self.config,
+            self.memory,
+            self.place,
+            trainer.views,
+            trainer.begun,
+            progress=(before, trainer.progress),
+            steps_left=steps_left,
+        )
+        for what in given_up:
+            warnings.warn(f"step {trainer.step}: for lack of memory, {what}", stacklevel=2)
+        if config.decisions != self.config.decisions:
+            self.config = config
+            trainer.follow(followed(config, trainer.begun))
+            self.folder.configure(config.to_json())
         if self.clock:
-            made = sum(at <= before for at in trainer.refine_at)
-            is_open = "train.refine_at" in self.config.automatic
-            if due and is_open and not self.clock.pays_to_refine(made):
-                plan, place = Plan.given(self.config).unrefined(due), (model.grid, trainer.views)
-                self._follow(plan.for_grid(self.config.train, *place, trainer.progress))
             self.clock.begins_anew()
-        may_stop = train.supersampled > 0 and supersampling_at(before, train) == 1
-        if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, before):
-            self._follow(Plan.given(self.config).with_one_sample())
-            message = f"step {step}: for lack of memory, features are of one sample a pixel"
-            warnings.warn(message, stacklevel=2)
-        try:
-            most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, before)
-        except UserError as error:
-            trainer.progress = before  # so that what is due now is due after the resumed step
-            self._save(finished=False)
-            raise UserError(
-                f"step {step}: to go on with {count} points, {error}, in another --out"
-            ) from None
-        if most < count:
-            warnings.warn(
-                f"step {step}: for lack of memory, {count - most} of {count} points are dropped,"
-                " those that images show least",
-                stacklevel=2,
-            )
-            keep_most_visible(trainer, most)
 
     def _after_step(self, log, terms, rates, before):
         """Write the row of the log, the preview and the checkpoint if due, in this order; return
@@ -324,17 +311,12 @@ class Training:
 # ---- beginning and resuming: nothing is written
 
 
-def _followed(config, begun):
-    """The settings that the engine follows; an extended training is not refined."""
-    return replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
-
-
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
     """Open the training in `folder`. With a checkpoint `stored` it resumes there; a finished one is
-    extended with new moments and without refinements. Without one it begins, and its hull and
-    memory complete the plan in config. Raises UserError for a scene that is broken or not the
+    extended with new moments and without refinements. Without one it begins with the decisions of
+    its hull and memory. Raises UserError for a scene that is broken or not the
     checkpoint's, for too little memory, and for a folder that cannot be written.
     """
     header, arrays = stored or ({"step": 0}, {})
@@ -342,17 +324,16 @@ def open_training(
     check_target(folder.config)
     folder.check_sheets(header["step"])
     begun = header["step"] if header.get("finished") else header.get("extended_from", 0)
-    followed = _followed(config, begun)
 
     net = UNet.of_settings(dev, config.network) if stored else begin_network(dev, config)
     split_files = list_split(config.scene.path)
-    memory_plan = MemoryPlan(followed, net, split_files.image_files)
+    memory, progress = Memory(config, net, split_files.image_files), 0.0
     if stored:
-        grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
         progress = progress_of(header | {"finished": False}, config.train.iterations)
-        memory_plan.points_that_fit(grid, points, header["depth_range"], progress)
+        points = Grid.of_header(header["grid"]), len(arrays["points.ids"]), header["depth_range"]
+        memory.check(least(config, progress), Place(*points), progress)
     else:
-        memory_plan.check_unseen()
+        memory.check(least(config))
     scene = open_scene(dev, config, ("train",), listed={"train": split_files})
     views, facts = scene.splits["train"], None
     info = identity(views) | ({"notes": scene.notes} if scene.notes else {})
@@ -365,17 +346,15 @@ def open_training(
     else:
         start = time.perf_counter()
         with Progress("carving the visual hull"):
-            fitting = fitting_hull(dev, config, views, memory_plan)
-            agreement, hull = fitting.agreement, fitting.hull
-            config = followed = fitting.plan.settings(config)
+            config, agreement, hull, depth_range = decide(dev, config, views, memory)
             seconds = time.perf_counter() - start
             sheet = sheet_of_masks(dev, views, hull, agreement)
-            facts = HullFacts(hull.capped, seconds, agreement.forgiven, fitting.given_up, sheet)
+            facts = HullFacts(seconds, agreement.forgiven, sheet)
         cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
-        model = Model(dev, hull.grid, fitting.depth_range, cloud, net=net)
+        model = Model(dev, hull.grid, depth_range, cloud, net=net)
         views, left_out = agreement.views, list(agreement.left_out)
         info["initial_points"] = model.cloud.count
-    trainer = Trainer(dev, followed, model, views)
+    trainer = Trainer(dev, followed(config, begun), model, views)
     if stored:
         state = header["step"], arrays, begun, header.get("exposed", ""), progress
         restore_training(trainer, *state)
@@ -386,7 +365,7 @@ def open_training(
         split = measured_split(config.scene.path)
         measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
     seconds = header.get("seconds", 0.0)
-    return Training(folder, config, trainer, info, memory_plan, facts, measured, seconds, began)
+    return Training(folder, config, trainer, info, memory, facts, measured, seconds, began)
 
 
 def _check_scene(folder, config, header, views):
@@ -424,7 +403,7 @@ def train_scene(
     settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
     folder = RunFolder(out)
     given = [(*s, "settings") for s in settings.items()]
-    config = run_config(folder, str(scene), preset, given)
+    config = config_of(folder, str(scene), preset, given, device)
     dev, is_stopped = open_device(device), is_stopped or (lambda: False)
     for member, member_config in members(folder, config):
         stored = stored_state(member, member_config)
@@ -455,13 +434,14 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
 
 
 def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Config]]:
-    """Yield the run in a folder, then its further members. Each of these has the plan that the
-    first has by then, and the next seed. An unfinished one comes twice: it ends with its own plan.
+    """Yield the run in a folder, then its further members. Each of these has the decisions
+    that the first has by then, and the next seed. An unfinished one comes twice: it ends with its
+    own.
     """
     yield folder, config
     if config.train.members > 1:
         first = load_config(folder.config)
-        config = Plan.given(first).settings(config)
+        config = as_decided(config, first)
         config.train.iterations = first.train.iterations
     for i in range(1, config.train.members):
         seed = (config.train.seed + i) % 2**32

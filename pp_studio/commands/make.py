@@ -3,18 +3,15 @@
 import argparse
 import importlib
 import itertools
-import os
 import shlex
 import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import psutil
-
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
-from pp_cl.config import field_of
+from pp_cl.config import PRESETS, field_of
 from pp_cl.errors import Stopped, UserError
 from pp_studio.capture import STAGES
 from pp_studio.commands.capture import add_hints
@@ -33,27 +30,22 @@ EPILOG = """FOLDER then holds
   scene, run           what was captured of photographs; the training, which all other commands take
 Its parts are capture, train, eval, export and render. The same command goes on where it stopped."""
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
-# Least minutes of each preset. On two cores with AVX-512, one minute of `small` shows photographs
-# of a head at 500 pixels sharper (LPIPS .113) than five of `tiny` (.133); `full` takes some 30 for
-# 15,000 of its 22,000 steps.
-PRESET_FROM = {"full": 30.0, "small": 1.0, "tiny": 0.0}
-# Images have about this many pixels along their longer side, if they are not the preset's: after
-# five minutes of `small`, LPIPS at 500 pixels is .077 with 500 and .086 with 333.
-SIDES = {"small": 500}
-PRESETS = [*PRESET_FROM][::-1]
 # Evaluation, splat and video, after the training, take this share of the minutes that the capture
 # leaves, within these bounds in minutes.
-AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
+AFTER, LEAST_AFTER, MOST_AFTER = 0.2, 1.0, 5.0
 LEAST_TRAINING = 0.6  # share of the minutes that the capture leaves
 # At least this share of the minutes is left after a capture: training then gets a third of all.
 LEAST_LEFT = 5 / 9
 LEAST_MORE = 0.1  # minutes that must be left for a finished training to go on
 LATE = 0.8  # the time per step is measured after this share of a training
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
+MOST_GAUSSIANS = 180_000  # of the splat: a page of them has 9.7 MB
 OF_SPLAT = 0.6  # share of the minutes left after the evaluation
 # of a training on photographs: poses are not exact, and surfaces would have pits
 SMOOTH = ["--set", "train.depth_weight=0.001"]
-LOOKED, FULL = 0.5, 0.9  # seconds in which the processor's use is measured; share of it
+# With so many times its minutes, a model is trained anew, as they allow for larger images: in more
+# steps on images as small, it would only learn its photographs by heart.
+ANEW = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,8 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--preset",
         choices=PRESETS,
-        help="of the training (by its minutes: tiny below 1; below 30 small, on images of about"
-        " 500 pixels; then full)",
+        help="of the training (if it is not given, the images' size goes by the minutes)",
     )
     add("--title", metavar="TEXT", help="of the page (the name of FOLDER)")
     add_hints(parser)
@@ -100,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
     )
     from pp_studio.video import check_video
 
-    share, out, is_scene = _share(), Path(options.out), _is_scene(options.source)
+    out, is_scene = Path(options.out), _is_scene(options.source)
     if is_scene:
         shared.refuse(options, ("turntable", "mask_command", "box"), "only of photographs")
     begin_result(out)
@@ -165,21 +156,17 @@ def run(options: argparse.Namespace) -> None:
                 show("So far this is the object's outline in the colours of the photographs.")
         if not folder.config.exists() or (options.preset and not folder.checkpoint.exists()):
             minutes = clock.training()
-            preset = preset or _sized(_preset(minutes, share), scene)
             train(*preset, *smooth, "--minutes", f"{minutes:.3g}")
         else:  # keep the run's preset; train refuses another
             train(*preset, *clock.iterations())
         if minutes := clock.more(folder):
             end, config = folder.rows()[-1], read_json(folder.config)
-            in_all = max(0.0, end["seconds"] / 60 + minutes)
-            wanted = options.preset or _preset(in_all, share)
-            if config["scene"]["downscale"] > 1 and wanted in _larger(config["preset"]):
-                # in more steps on images as small, it would only learn its photographs by heart
+            is_longer = 60 * minutes >= ANEW * end["seconds"]
+            if not preset and config["scene"]["downscale"] > 1 and is_longer:
                 kept = _set_aside(folder)
-                print(f"the preset is {wanted} now; {kept} is the model so far", flush=True)
+                print(f"trained anew, in more minutes; {kept} is the model so far", flush=True)
                 # an open page keeps that model, which is better than the new one's first previews
-                words = preset or _sized(wanted, scene)
-                train(*words, *smooth, "--minutes", f"{minutes:.3g}", follow=None)
+                train(*smooth, "--minutes", f"{minutes:.3g}", follow=None)
                 if (known := kept / length.FILE).exists():  # the scene and its unit are the same
                     write_json(folder.path / length.FILE, read_json(known))
             else:
@@ -191,7 +178,8 @@ def run(options: argparse.Namespace) -> None:
         if not is_newer(out / SPLAT, folder.checkpoint):
             show("Trained and measured; splat and video follow.", split)
             # export writes these Gaussians to the file
-            fitted_gaussians(load(folder.path, options.device), QUICK, OF_SPLAT * clock.left)
+            limits = OF_SPLAT * clock.left, MOST_GAUSSIANS
+            fitted_gaussians(load(folder.path, options.device), QUICK, *limits)
             words = ["--format", "splat"]
             step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
         if not is_newer(out / video, folder.checkpoint):
@@ -263,7 +251,7 @@ class _Clock:
         """Print how the minutes are divided before the photographs are read."""
         capture = min(PER_PHOTOGRAPH * _photographs(source), self.minutes)
         print(
-            f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a quarter of the"
+            f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a fifth of the"
             " rest for evaluation, splat and video, and what is left for the training",
             flush=True,
         )
@@ -334,34 +322,6 @@ def _wrote_hull(out, scene, title, options, masks):
     return hull is not None
 
 
-def _preset(minutes, share):
-    """The preset for the minutes at a share of the processor; prints if other programs lower it."""
-    quiet, chosen = (
-        next(name for name, least in PRESET_FROM.items() if duration >= least)
-        for duration in (minutes, share * minutes)
-    )
-    if chosen != quiet:
-        print(
-            f"other programs take {1 - share:.0%} of the processor: the preset is {chosen}, not"
-            f" {quiet}, as on a quiet machine; --preset {quiet} keeps it",
-            flush=True,
-        )
-    return chosen
-
-
-def _sized(preset, scene):
-    """The arguments of a training with a preset on images of its SIDES."""
-    from pp_cl.engine import fitting_downscale
-    from pp_cl.scene import scene_frames
-
-    words = ["--preset", preset]
-    if preset in SIDES:
-        cameras = [frame.camera for frame in scene_frames(scene)]
-        size = max((camera.width, camera.height) for camera in cameras)
-        words += ["--downscale", str(fitting_downscale(size, SIDES[preset]))]
-    return words
-
-
 def _written(scene):
     """When a capture wrote a scene; None if there is none."""
     file = Path(scene, "transforms.json")
@@ -376,20 +336,6 @@ def _set_aside(folder):
         if not kept.exists():
             return folder.path.rename(kept)
         kept = folder.path.with_name(f"run-of-{steps}-steps-{number}")
-
-
-def _larger(preset):
-    """The presets for larger images than a run's."""
-    return PRESETS[PRESETS.index(preset) + 1 :] if preset in PRESETS else []
-
-
-def _share():
-    """The share of the processor left by running programs, which are expected to run on."""
-    cores, busy = os.cpu_count() or 1, psutil.cpu_percent(interval=LOOKED) / 100
-    load = cores * busy
-    if busy > FULL:  # programs that wait count, too; else the mean has some that ended since
-        load = max(load, psutil.getloadavg()[0])
-    return cores / (cores + load)
 
 
 def _is_scene(source):

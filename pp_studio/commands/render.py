@@ -22,7 +22,8 @@ MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
 FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
 MOST_FRAMES = 100_000
-LEAST_HEIGHT = 720  # least height of an orbit or spiral; mp4 needs an even width and height
+# bounds of the height of an orbit or spiral; mp4 needs an even width and height
+LEAST_HEIGHT, MOST_HEIGHT = 480, 1080
 
 
 def _colour(text):
@@ -56,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size",
         type=shared.size,
         metavar="WxH",
-        help="pixels (default: those of the training; an orbit or spiral is at least"
-        f" {LEAST_HEIGHT} high)",
+        help="pixels (default: those of the training; an orbit or spiral is"
+        f" {LEAST_HEIGHT} to {MOST_HEIGHT} high)",
     )
     add(
         "--fov",
@@ -229,7 +230,7 @@ def _cameras(run, path, count, *, size, fov):
             ) from None
     training = run.cameras("train")
     first = shaped(training[0])
-    if not size and first.height < LEAST_HEIGHT:
-        width = 2 * round(first.width / first.height * LEAST_HEIGHT / 2)
-        first = first.resized(width, LEAST_HEIGHT)
+    if not size:
+        height = 2 * round(min(max(first.height, LEAST_HEIGHT), MOST_HEIGHT) / 2)
+        first = first.resized(2 * round(first.width / first.height * height / 2), height)
     return around(path, training, run.model.positions(), first, count)

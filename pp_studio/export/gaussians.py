@@ -142,13 +142,16 @@ def windows(longest: float) -> tuple[float, float]:
     return least, least * 2**DOUBLINGS
 
 
-def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) -> PointCloud:
+def fit_gaussians(
+    run: Run, steps: int, cell: float, minutes: float = math.inf, most: float = math.inf
+) -> PointCloud:
     """Fit Gaussians in `steps` steps, or as many as fit in `minutes`. They begin at the points that
-    training views show. cell: voxel sizes; the points in a cube of this side begin as one; 0: each
-    alone. Their SH are 3D Gaussian splatting's, with sRGB colour as the first three features.
+    training views show. cell: voxel sizes; the points in a cube of this side begin as one, or of a
+    larger one that leaves at most `most`; 0: each alone. Their SH are 3D Gaussian splatting's, with
+    sRGB colour as the first three features.
     """
     began = time.monotonic()
-    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the fit does the rest
+    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell, most)  # fitted later
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
@@ -179,15 +182,17 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     return cloud
 
 
-def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math.inf) -> Gaussians:
+def fitted_gaussians(
+    run: Run, quality: str | None = None, minutes: float = math.inf, most: float = math.inf
+) -> Gaussians:
     """The run's Gaussians, fitted once per checkpoint and kept as FILE in the run's folder for
-    later calls. quality: one of QUALITIES; None: any that is kept, else QUICK. minutes: limits the
-    fit to fewer steps. Raises UserError as check_drawable does.
+    later calls. quality: one of QUALITIES; None: any that is kept, else QUICK. minutes,
+    most: as in fit_gaussians(). Raises UserError as check_drawable does.
     """
     check_drawable(run)
     if gaussians := kept_gaussians(run, [quality] if quality else QUALITIES):
         return gaussians
-    table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes))
+    table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes, most))
     specular = _fit_specular(run, _fitted(run, table, {}))
     stored = {LAYER + name: array for name, array in specular.items()}
     try:
@@ -345,10 +350,10 @@ def _fitted_views(run):
     return [view for view in views if view.name not in run.header.get("left_out", ())]
 
 
-def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
-    """The run's points as Gaussians, except those without coefficients (N, 9, 3) of basis(). cell:
-    voxel sizes; the points in a cube of this side become one Gaussian of their mean, covariance and
-    colour that absorbs as much light; 0: each stays alone.
+def begun(run: Run, coefficients: np.ndarray, cell: float, most: float = math.inf) -> PointCloud:
+    """The run's points as Gaussians, except those without coefficients (N, 9, 3) of basis(). cell,
+    most: as in fit_gaussians(); the points in a cube become one Gaussian of their mean, covariance
+    and colour that absorbs as much light.
     """
     dev, cloud, grid = run.dev, run.model.cloud, run.model.grid
     rows = np.flatnonzero(coefficients.any((1, 2)))
@@ -362,6 +367,9 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     group = np.arange(len(rows))  # the Gaussian of each point
     if cell:
         group = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
+        while group.max() >= most:  # they lie on surfaces
+            cell *= max(1.05, math.sqrt((group.max() + 1) / most))
+            group = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
     count = group.max() + 1
     weight = area * opacity + 1e-6  # above 0, also for a lone invisible point
     total = np.bincount(group, weight, count)[:, None]

@@ -180,8 +180,12 @@ def _figures(run, evaluation):
     """[(name, value)] of the table. evaluation: the contents of metrics.json, {} if none."""
     rows = [(LABELS[name], f"{value:.4g}") for name, value in evaluation.get("mean", {}).items()]
     if rows:
-        rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {len(evaluation['per_image'])} views)")
+        many = f"{len(evaluation['per_image'])} views"
+        if size := evaluation.get("size"):
+            many += f" of {size[0]}x{size[1]}"
+        rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {many})")
     cameras = run.cameras("train")
+    decisions = (why.partition(": ") for why in run.config.decisions.values())
     return [
         *rows,
         ("photographs in the training", str(len(cameras))),
@@ -189,4 +193,5 @@ def _figures(run, evaluation):
         ("points", f"{run.model.cloud.count:,}"),
         ("steps", f"{run.header['step']:,}"),
         ("device", run.dev.name),
+        *((key, value) for key, _, value in decisions),
     ]

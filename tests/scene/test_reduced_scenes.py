@@ -55,6 +55,20 @@ def scene(tmp_path):
     return write_ball_scene(tmp_path / "ball", size=98)
 
 
+@pytest.mark.parametrize("downscale, stored, size", [(1.6, 61, 61), (2.8, 70, 35)])
+def test_what_no_whole_number_gives_is_resampled_once(scene, downscale, stored, size):
+    """It keeps as many stored pixels for each of its own as the whole number below would."""
+    (whole, *_), (view, *_) = (
+        load_scene(scene, downscale=factor).splits["train"] for factor in (1, downscale)
+    )
+    assert view.image.shape == (stored, stored, 4) and view.camera.width == size
+    names, expected = ("fx", "cy", "width"), whole.file_camera.downscaled(downscale)
+    assert [getattr(view.camera, n) for n in names] == [getattr(expected, n) for n in names]
+    assert view.file_downscale == pytest.approx(downscale, rel=0.01)
+    assert view.file_camera.width == 98 and view.digest == whole.digest
+    assert view.image[..., 3].mean() == pytest.approx(whole.image[..., 3].mean(), rel=0.01)
+
+
 def large(monkeypatch, most=8 * 4 * 50 * 50):
     """Count scenes as large from `most` bytes on: eight images of 98 pixels are then halved."""
     monkeypatch.setattr("pp_cl.scene.image_file.MOST_IMAGE_BYTES", most)

@@ -13,6 +13,7 @@ from pp_cl.engine.training.schedule import growths, has_passed, refinements, sup
 from pp_cl.engine.training.specular import fit_steps
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.clock import FEWEST, MEASURED_AT, RESERVED, Clock, seconds_after
+from pp_cl.session.decide import PAYS_FROM
 from pp_cl.settings import TrainConfig
 
 SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
@@ -35,7 +36,7 @@ def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0, endin
         if any(has_passed(share, before, clock.progress) for share in growths(train)):
             made = [share for share in refinements(train) if share <= before]
             due = any(has_passed(share, before, clock.progress) for share in refinements(train))
-            if due and clock.pays_to_refine(len(made)):
+            if due and clock.steps_left >= PAYS_FROM[min(len(made), 1)]:
                 refined.append(clock.progress)
             clock.begins_anew()
         if has_passed(MEASURED_AT, before, clock.progress):

@@ -6,7 +6,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.config import load_config, run_config
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session.plan import Plan
+from pp_cl.session.decide import as_decided
 from pp_cl.session.training import open_training
 
 
@@ -39,14 +39,14 @@ def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong
 
 
 def test_a_further_member_begins_with_the_points_of_the_first(dev, tmp_path):
-    """Its plan has the refinements that the first has chosen, with the points that these need."""
+    """It has the refinements that the first has chosen, with the points that these need."""
     scene, counts = write_ball_scene(tmp_path / "ball", views=8, size=128), []
     given = [("points.count", 3000, "test"), ("scene.downscale", 1, "test")]
     config = run_config(RunFolder(tmp_path / "a"), scene, "tiny", given)
     for name in "ab":
         training = open_training(dev, RunFolder(tmp_path / name), config, None)
         counts.append(training.trainer.model.cloud.count)
-        config = Plan.given(training.config).settings(config)
+        config = as_decided(config, training.config)
     assert counts[0] == counts[1] > 1.1 * 3000
 
 
@@ -59,5 +59,4 @@ def test_settings_never_change(dev, tmp_path, scene):
     chosen.run()
     assert load_config(folder.config) == chosen.config != config
     assert chosen.trainer.config == chosen.config
-    plan = Plan.given(chosen.config)
-    assert plan.settings(config) == chosen.config and plan.radius > 0
+    assert as_decided(config, chosen.config) == chosen.config and chosen.config.raster.radius > 0

@@ -8,7 +8,6 @@ from pyopencl.array import Array
 
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.engine.training.prune import (
-    most_visible,
     points_of_large_parts,
     points_that_views_show,
     points_to_keep,
@@ -33,13 +32,14 @@ def after_update(trainer: Trainer, rates: Rates, before: float) -> None:
     """Decide on exposure, smooth the SH coefficients, update the EMA, prune and refine, each if it
     is due after this step. before: the training's progress at its beginning.
     """
-    train, step = trainer.config.train, trainer.step
+    step = trainer.step
 
     def passes(shares):
         return any(has_passed(share, before, trainer.progress) for share in shares)
 
-    if trainer.make_room and passes(growths(train)):
+    if trainer.make_room and passes(growths(trainer.config.train)):
         trainer.make_room(before)
+    train = trainer.config.train
     for is_last in (False, True):
         due = step == decided_at(trainer.begun, len(trainer.views), is_last=is_last)
         if trainer.exposure and due:
@@ -77,11 +77,6 @@ def prune(trainer: Trainer) -> None:
     """Drop the points that were in enough images and had too low a blend weight or opacity."""
     opacity, train = trainer.model.cloud.opacity, trainer.config.train
     keep(trainer, points_to_keep(trainer.dev, trainer.state, opacity, train))
-
-
-def keep_most_visible(trainer: Trainer, count: int) -> None:
-    """Drop all points but the `count` most visible in images."""
-    keep(trainer, most_visible(trainer.dev, trainer.state, trainer.model.cloud.opacity, count))
 
 
 def keep(trainer: Trainer, rows: Array) -> None:

@@ -25,37 +25,21 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainC
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
     PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
     train.prune_weight in one of them and its opacity, the mean of all sides, is at least
-    LEAST_OPACITY, and is counted anew, with a weight just below train.prune_weight so that
-    most_visible() does not take it for unseen. Points seen less often are kept.
+    LEAST_OPACITY, and is counted anew. Points seen less often are kept.
 
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
-    weight, opacities = _weights_and_opacities(dev, state, opacity)
-    times_seen = dev.download(state.times_seen)
-    judged = times_seen >= schedule.PRUNE_LOOKS
-    least = np.float32(train.prune_weight)
-    passes = (weight >= least) & (opacities >= LEAST_OPACITY)
-    too_low = np.minimum(weight, np.nextafter(least, np.float32(0)))
-    dev.write(state.max_weight, np.where(judged, too_low, weight))
-    dev.write(state.times_seen, np.where(judged, np.float32(0), times_seen))
-    return _listed(dev, ~judged | passes, weight)
-
-
-def most_visible(dev: Device, state: PointState, opacity: Array, count: int) -> Array:
-    """(count,) uint32, ascending: the points of the highest blend weights since they were last
-    judged, or then; of equal ones the most opaque. Raises Diverged as points_to_keep() does.
-    """
-    weight, opacities = _weights_and_opacities(dev, state, opacity)
-    return dev.upload(np.sort(np.lexsort((-opacities, -weight))[:count]), np.uint32)
-
-
-def _weights_and_opacities(dev, state, opacity):
     weight, opacities = dev.download(state.max_weight), dev.download(opacity)[:, 0]
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
-    return weight, opacities
+    times_seen = dev.download(state.times_seen)
+    judged = times_seen >= schedule.PRUNE_LOOKS
+    passes = (weight >= np.float32(train.prune_weight)) & (opacities >= LEAST_OPACITY)
+    dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
+    dev.write(state.times_seen, np.where(judged, np.float32(0), times_seen))
+    return _listed(dev, ~judged | passes, weight)
 
 
 def final_points_to_keep(

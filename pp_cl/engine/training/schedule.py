@@ -6,7 +6,6 @@ train.iterations that is done, or of train.minutes that has passed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pp_cl.settings import NetworkConfig, TrainConfig
@@ -114,42 +113,6 @@ def growths(train: TrainConfig) -> list[float]:
 def has_passed(share: float, before: float, after: float) -> bool:
     """Whether a step passes this share, which takes the progress from `before` to `after`."""
     return before < share <= after
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A run of steps without a refinement. points: expected at its beginning. refinements: still to
-    come. is_averaged: averages are kept. supersampling: as RenderResult.supersampling.
-    """
-
-    points: int
-    refinements: int
-    is_averaged: bool
-    supersampling: int
-
-
-def expected_stretches(train: TrainConfig, points: int, progress: float) -> Iterator[Stretch]:
-    """The stretches of a training that has `points` points now. The numbers of points that later
-    prunings leave are estimates.
-    """
-    refined, start = refinements(train), 0.0
-    ends = {*refined, EMA_FROM if train.ema else 1.0, 1 - train.supersampled, 1.0}
-    stages = 0.0, *refined, 1.0
-    for end in sorted(ends):
-        if progress < end:
-            now = max(start, progress)
-            to_come = sum(now < at for at in refined)
-            is_averaged = train.ema and now >= EMA_FROM
-            yield Stretch(points, to_come, is_averaged, supersampling_at(now, train))
-            first = max(at for at in stages if at <= start)
-            last = min(at for at in stages if at >= end)
-            to_end, of_stage = (
-                prunings(train, *(round(at * train.iterations) for at in shares))
-                for shares in ((now, end), (first, last))
-            )
-            pruned = to_end / max(1, of_stage)
-            points = round(points * LEFT_BY_PRUNING**pruned) * (8 if end in refined else 1)
-        start = end
 
 
 def gamma_at(progress: float) -> float:

@@ -7,7 +7,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.stored import cloud_arrays, state_arrays
 from pp_cl.engine.training.between import refine
-from pp_cl.engine.training.prune import final_points_to_keep, most_visible, points_to_keep
+from pp_cl.engine.training.prune import final_points_to_keep, points_to_keep
 from pp_cl.engine.training.state import PointState
 from pp_cl.errors import Diverged
 from pp_cl.files.run_folder import RunFolder
@@ -64,20 +64,6 @@ def test_only_what_was_seen_is_judged(dev):
     state.times_seen.set(np.float32([100] * 6))
     state.max_weight.set(np.float32([0.01, 0.03, 0.02, 0, 0, 0]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [1], "one always is"
-
-
-def test_what_is_seen_most_is_kept_and_of_equals_the_opaque(dev):
-    state = PointState(dev, PointCloud.create(dev, np.arange(5), 0))
-    state.max_weight.set(np.float32([0, 1, 0, 3, 0]))
-    opacity = dev.upload(rows([0.1, 0.1, 0.3, 0.1, 0.2]))
-    assert most_visible(dev, state, opacity, 4).get().tolist() == [1, 2, 3, 4]
-    assert most_visible(dev, state, opacity, 1).get().tolist() == [3]
-    settings = TrainConfig(prune_weight=0.5)
-    state.times_seen.set(np.float32([100, 100, 9, 100, 0]))
-    state.max_weight.set(np.float32([0.7, 0.6, 0.1, 3, 0]))
-    opacity.set(rows([0.1, 0.2, 0.3, 0.1, 1]))
-    assert points_to_keep(dev, state, opacity, settings).get().tolist() == [0, 1, 2, 3, 4]
-    assert most_visible(dev, state, opacity, 3).get().tolist() == [0, 1, 3], "those just judged"
 
 
 @pytest.mark.parametrize("peak, opacity", [(np.nan, 1), (np.inf, 1), (0.5, np.nan), (0.5, -np.inf)])

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.runs import SETTINGS, spoken
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.commands import COMMANDS
@@ -90,8 +89,9 @@ def test_minutes_that_allow_for_larger_images_train_anew(made, capsys, monkeypat
     scene, folder = made
     monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
     monkeypatch.setattr(make, "LEAST_MORE", -100)
-    monkeypatch.setitem(make.PRESET_FROM, "small", 0.1)
-    monkeypatch.setattr(make, "_share", lambda: 1.0)
+    monkeypatch.setattr(make, "ANEW", 0.0)
+    monkeypatch.setattr("pp_cl.session.decide.free_share", lambda: 1.0)
+    monkeypatch.setattr("pp_cl.session.decide.SIDES", {0.0: ("small", 500)})
     folder = shutil.copytree(folder, folder.with_name(f"larger_{downscale}"))
     config = json.loads((folder / "run/config.json").read_text())
     config["scene"]["downscale"] = downscale
@@ -107,7 +107,7 @@ def test_minutes_that_allow_for_larger_images_train_anew(made, capsys, monkeypat
         assert "extends a finished training" in capsys.readouterr().out
         assert load_header(folder / "run")["step"] > step
         return
-    assert "the preset is small now; " in capsys.readouterr().out
+    assert "trained anew, in more minutes; " in capsys.readouterr().out
     assert (folder / f"run-of-{step}-steps/checkpoint.npz").read_bytes() == before
     assert json.loads((folder / "run/config.json").read_text())["preset"] == "small"
     after = (folder / "run/checkpoint.npz").read_bytes()
@@ -152,10 +152,10 @@ def test_attempts_that_fail_do_not_count(tmp_path, minutes):
 def test_a_third_of_the_minutes_is_the_trainings(tmp_path, minutes, capsys):
     with make._Clock(tmp_path / "make.json", 9, None) as clock:
         minutes(3)
-        assert clock.training() == pytest.approx(4.5) and clock.left == pytest.approx(6)
+        assert clock.training() == pytest.approx(4.8) and clock.left == pytest.approx(6)
         assert "too long" not in capsys.readouterr().out
         minutes(10)
-        assert clock.training() == pytest.approx(3.75)
+        assert clock.training() == pytest.approx(4)
         assert "9 minutes: 13.0 have passed, which is too long; 18.0 are taken" in (
             capsys.readouterr().out
         )
@@ -191,7 +191,6 @@ def test_a_scene_that_has_changed_is_trained_anew(tmp_path, monkeypatch):
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
-    monkeypatch.setattr(make, "_sized", lambda preset, scene: ["--preset", preset])
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
     (tmp_path / "photographs").mkdir()
     for folder in ("scene/capture", "run-of-60-steps", "run"):
@@ -205,19 +204,6 @@ def test_a_scene_that_has_changed_is_trained_anew(tmp_path, monkeypatch):
             spoken(["make", tmp_path / "photographs", "--out", out, *hints])
     assert [there for _, there in trained] == [True, False] and "--minutes" in trained[1][0]
     assert (out / "run-of-60-steps-2/checkpoint.npz").exists()
-
-
-def test_a_preset_that_others_make_smaller_is_told(capsys):
-    assert make._preset(15, 1.0) == "small" and not capsys.readouterr().out
-    assert make._preset(3, 0.2) == "tiny"
-    line = "other programs take 80% of the processor: the preset is tiny, not small"
-    assert line in capsys.readouterr().out
-
-
-def test_images_are_as_large_as_their_minutes_make_sharp(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball", size=1000, views=3)
-    assert make._sized("small", scene) == ["--preset", "small", "--downscale", "2"]
-    assert make._sized("tiny", scene) == ["--preset", "tiny"]
 
 
 def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
@@ -295,21 +281,19 @@ def test_what_is_not_its_own_stays(made, tmp_path):
     assert page.read_text("utf-8").endswith("mine")
 
 
+PRESET = ["--preset", "tiny"]
+
+
 class Enough(Exception):
     """Raised to end the command once the test knows its steps."""
 
 
 @pytest.mark.usefixtures("minutes")  # a busy machine takes none of them
 @pytest.mark.parametrize(
-    "words, preset",
-    [
-        ([], "small"),
-        (["--minutes", "1.5"], "tiny"),
-        (["--minutes", "60"], "full"),
-        (["--preset", "tiny"], "tiny"),
-    ],
+    "words, minutes",
+    [([], "16"), (["--minutes", "1.5"], "0.9"), (["--minutes", "60"], "55"), (PRESET, "16")],
 )
-def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
+def test_photographs_are_captured_first(tmp_path, monkeypatch, words, minutes):
     steps = []
 
     def step(name, *arguments, **_):
@@ -320,8 +304,6 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
-    monkeypatch.setattr(make, "_share", lambda: 1.0)
-    monkeypatch.setattr(make, "_sized", lambda preset, scene: ["--preset", preset])
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
     photographs, folder = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
@@ -332,12 +314,12 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
     scene, out = (str(tmp_path / "out" / name) for name in ("scene", "run"))
     box = "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
-    minutes = {"1.5": "0.9", "60": "55"}.get(words[-1] if words else "", "15")
+    preset = words if words == PRESET else []
     assert steps == [
         ("capture", (str(photographs), "--out", scene, "--turntable", "--masks", "M", box)),
         (
             "train",
-            (scene, "--out", out, "--preset", preset, *make.SMOOTH, "--minutes", minutes),
+            (scene, "--out", out, *preset, *make.SMOOTH, "--minutes", minutes),
         ),
     ]
 
@@ -348,15 +330,3 @@ def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
     assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
     status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])
     assert status == 2 and "give photographs, a video or a scene" in lines[-1]
-
-
-@pytest.mark.parametrize(
-    "busy, load, share",
-    [(0, 4, 1), (50, 4, 2 / 3), (100, 4, 1 / 3), (100, 0, 1 / 2)],
-    ids=["ended", "one of two cores", "four programs", "no mean yet"],
-)
-def test_programs_that_run_take_their_share(monkeypatch, busy, load, share):
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
-    monkeypatch.setattr("psutil.cpu_percent", lambda interval: busy)
-    monkeypatch.setattr("psutil.getloadavg", lambda: (load, load, load))
-    assert make._share() == pytest.approx(share)

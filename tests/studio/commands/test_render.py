@@ -84,7 +84,7 @@ def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
     for more in ([], ["--size", "32x32"], ["--format", "png"], ["--path", "spiral"]):
         assert main([*words, *more]) == 0
     names = {path.name for path in (run / "render").iterdir() if path.name[0] != "."}
-    large = {"orbit_720x720.mp4", "orbit_720x720", "spiral_720x720.mp4"}
+    large = {"orbit_480x480.mp4", "orbit_480x480", "spiral_480x480.mp4"}
     assert names == large | {"orbit_32x32.mp4"}
     assert "/nowhere" in failure(*words[:2], "--path", "test")
     assert "every run has are orbit and spiral" in failure(*words[:2], "--path", "circle")

@@ -152,13 +152,17 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     measured = RunFolder(trained.folder.path).evaluation("test")
     measured.mkdir(parents=True)
     (measured / "metrics.json").write_text(
-        '{"mean": {"psnr": 30.5, "ssim": 0.9, "lpips": 0.1}, "per_image": [1, 2]}'
+        '{"mean": {"psnr": 30.5, "ssim": 0.9, "lpips": 0.1}, "per_image": [1, 2], "size": [48, 40]}'
     )
     shutil.copy(folder / "thumbnail.png", measured / "comparison.png")
     write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     text, named = shown(folder)
     assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
-    assert "30.5 (mean of 2 views)" in text and "LPIPS" in text and "still to come" not in text
+    assert (
+        "30.5 (mean of 2 views of 48x40)" in text
+        and "LPIPS" in text
+        and "still to come" not in text
+    )
     assert pages == ["first", "fitted"]  # the model's page shows the splat now
     write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     assert len(pages) == 2

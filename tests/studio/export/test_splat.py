@@ -144,6 +144,8 @@ def test_points_of_a_cell_begin_as_one_that_looks_like_them(run):
         away = cKDTree(places).query(positions, p=np.inf)[0] / run.model.grid.voxel_size
         assert away.max() < 1e-4 if cell == 0 else cloud.count < 0.7 * len(places)
         assert away.max() <= cell
+    most = cloud.count // 2
+    assert 0.7 * most < begun(run, coefficients, cell, most).count <= most
     # merging points of one colour in a cell keeps that colour
     sh = cloud.sh[0].get()[:, 0, :3] * CONSTANT
     assert coefficients[:, 0].min() - 1e-5 < sh.min() and sh.max() < coefficients[:, 0].max() + 1e-5
