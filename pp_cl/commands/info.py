@@ -160,8 +160,8 @@ def _scene_rows(facts):
         f"{mask['view']}: its mask rejects {mask['share']:.0%} of what others agree on"
         for mask in masks["disagreeing"]
     ] + [
-        f"{name}: {share:.0%} of its mask lies beside the object; it is left out"
-        for name, share in masks.get("left_out", {}).items()
+        f"{name}: its camera or mask contradicts the others; it is left out"
+        for name in masks.get("left_out", {})
     ]
     rows = [
         ("scene", f"{facts['scene']}, format {facts['format']}"),

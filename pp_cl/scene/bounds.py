@@ -14,7 +14,6 @@ CROPPED_MARGIN = 0.5
 # sizes of the eyes' box that float32 can compute with, world units (docs/scenes.md)
 LEAST_REACH, MOST_REACH = 1e-12, 1e15
 LEAST_SHARE = 1e-9  # a smaller share of a distance is rounding
-LEAST_SLACK = 1e-6  # a smaller share of the cameras' reach is the solver's rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
 
 
@@ -78,28 +77,6 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
                 break
             return box
     raise UserError(f"{_all_of(views)} do not bound the object: it must be seen from several sides")
-
-
-def looking_elsewhere(views: Sequence[View]) -> list[View]:
-    """The views whose pyramids miss the place where most pyramids meet: the place with the least
-    sum of distances to all pyramids, which a few views do not move, however far off they are.
-    """
-    from scipy.optimize import linprog  # takes long to import
-
-    unit = 2.0 ** math.frexp(reach_of(views))[1]
-    planes = [_silhouette_planes(view, None) for view in views]
-    owner = np.repeat(np.arange(len(views)), [len(of_view) for of_view in planes])
-    stacked = np.concatenate(planes)
-    outside = (owner[:, None] == np.arange(len(views))).astype(float)  # each view's distance
-    solution = linprog(
-        np.append(np.zeros(3), np.ones(len(views))),
-        -np.column_stack([stacked[:, :3], outside]),
-        -stacked[:, 3] / unit,
-        bounds=[(None, None)] * 3 + [(0, None)] * len(views),
-    )
-    if solution.status != SOLVED:
-        return []
-    return [v for v, far in zip(views, solution.x[3:], strict=True) if far > LEAST_SLACK]
 
 
 def _silhouette_planes(view, cropped_margin):

@@ -15,7 +15,8 @@ from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
-from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
+from pp_cl.scene.bounds import bounding_box, reach_of
+from pp_cl.scene.wrong_cameras import looking_away, wrong_cameras
 
 # PlenopticPoints supplemental, Table 4: all grids stay below this, one with too few points
 CELL_CAP = 2**27
@@ -308,24 +309,26 @@ def agreement_of(
     dev: Device, views: Sequence[View], box: np.ndarray | None = None
 ) -> tuple[Agreement, Beside]:
     """How far masks agree, measured by the share of each mask beside the hull. Views are left out
-    if they look elsewhere, or if that share exceeds MOST_BESIDE and several times the usual share.
-    If all masks deviate a little, as many as necessary are forgiven. Raises UserError as
-    build_grid() does.
+    that are suspects(), or if that share exceeds MOST_BESIDE and several times the usual share. If
+    all masks deviate a little, as many as necessary are forgiven. Raises UserError as build_grid()
+    does.
     """
     if not any(view.has_mask for view in views):
-        return Agreement(list(views), {}, 0), Beside(0.0, 0.0)
+        kept, left_out = _without_suspects(views)
+        return Agreement(kept, left_out, 0), Beside(0.0, 0.0)
     most = int(MOST_LEFT_OUT * len(views))
-    elsewhere = looking_elsewhere(views)
-    left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
-    kept, forgiven = [view for view in views if view.name not in left_out], most // 2
-    beside = 1.0
-    try:
-        shares = shares_beside(dev, kept, box, 0)
-        beside = float(shares.mean())
-        if shares.max() <= MOST_BESIDE / 2:
-            return Agreement(kept, left_out, 0), Beside(beside, beside)
-    except UserError:  # no place is in all masks
-        forgiven = most
+    kept, left_out = list(views), dict[str, float]()
+    for is_sorted in (False, True):
+        forgiven = most // 2
+        try:
+            shares = shares_beside(dev, kept, box, 0)
+            beside = float(shares.mean())
+            if shares.max() <= MOST_BESIDE / 2:
+                return Agreement(kept, left_out, 0), Beside(beside, beside)
+        except UserError:  # no place is in all masks
+            beside, forgiven = 1.0, most
+        if not is_sorted:
+            kept, left_out = _without_suspects(views)
     while len(left_out) < most:
         shares = shares_beside(dev, kept, box, forgiven)
         worst = int(shares.argmax())
@@ -341,6 +344,23 @@ def agreement_of(
     quarter = int(MOST_FORGIVEN * len(kept))
     forgiving = shares_beside(dev, kept, box, quarter).mean() if beside > MOST_BESIDE else beside
     return Agreement(kept, left_out, least), Beside(beside, float(forgiving))
+
+
+def suspects(views: Sequence[View]) -> dict[int, float]:
+    """The views whose cameras, or whole masks, contradict the others: {index: share of the mask
+    beside the others' hull}.
+    """
+    if any(view.has_mask for view in views):
+        return wrong_cameras(views)
+    return dict.fromkeys(looking_away(views), 1.0)
+
+
+def _without_suspects(views: Sequence[View]) -> tuple[list[View], dict[str, float]]:
+    """(the other views, {name: share} of the suspects()), if these are not too many."""
+    left_out = {views[i].name: share for i, share in suspects(views).items()}
+    if len(left_out) > math.ceil(MOST_LEFT_OUT * len(views)):
+        return list(views), {}
+    return [view for view in views if view.name not in left_out], left_out
 
 
 def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:

@@ -13,10 +13,17 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, evenly, fitting_downscale
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, few_names
 from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.gaze import ahead, meeting, upward
-from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, Beside, agreement_of, shares_beside
+from pp_cl.scene.hull import (
+    MOST_LEFT_OUT,
+    Agreement,
+    Beside,
+    agreement_of,
+    shares_beside,
+    suspects,
+)
 from pp_cl.scene.image_file import ImageFile, shrink
 from pp_cl.scene.listing import DEMO, find_reader, list_split, scene_box, scene_splits
 from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
@@ -46,15 +53,18 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     """
     path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
-    cameras = [view.file_camera for view in views]
-    has_masks = any(view.has_mask for view in views)
+    has_masks, kept = any(view.has_mask for view in views), list(views)
+    try:
+        agreement, beside = agreement_of(dev, views, box)
+        kept = agreement.views
+    except UserError as error:  # no place is in all masks
+        fault, beside = error, NOWHERE
+    cameras = [view.file_camera for view in kept]
     reading = None if has_masks or axes else other_axes(cameras, find_reader(path).STATES)
     if reading:
         raise WrongCameras(_told(path, "its cameras do not look at one place", reading, cameras))
-    try:
-        agreement, beside = agreement_of(dev, views, box)
-    except UserError as error:  # no place is in all masks
-        fault, beside = error, NOWHERE
+    if not has_masks and axes != STATED and (names := _suspected(kept)):
+        raise WrongCameras(f"{path}: {names}: their cameras contradict the others; correct them")
     whole = beside
     if box is not None and beside.strictly > MOST_BESIDE:  # the box may cut the object off
         with suppress(UserError):
@@ -69,21 +79,28 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
         if whole.strictly <= MOST_BESIDE:
             message = message or f"{path}: {what}: cameras or masks are inexact"
             warnings.warn(message, stacklevel=2)
+    names = _suspected(kept) if fault or whole.strictly > MOST_BESIDE else ""
+    first = f", first those of {names}" if names else ""
     is_wrong = whole.strictly > MOST_BESIDE and whole.forgiving > PERSISTING
     if is_wrong and axes != STATED and not fault:
         raise WrongCameras(
             f"{path}: {what}, so cameras or masks are wrong, in a way that pp-cl does not know:"
-            " check the order of poses and images, focal lengths and masks; if all are right, write"
-            f' {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
+            f" check the order of poses and images, focal lengths and masks{first}; if all are"
+            f' right, write {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
         )
     if fault:
-        raise fault
+        raise WrongCameras(f"{fault}{first}")
     if (oblong := _oblong(cameras)) and not (has_masks and beside.strictly < EXACT):
         warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=2)
     if by := upward([view.camera for view in agreement.views])[1]:
         message = f"upper edges of the images contradict each other; up is taken from {by}"
         warnings.warn(f"{path}: {message}", stacklevel=2)
     return agreement, beside.strictly
+
+
+def _suspected(views):
+    """The names of suspects()."""
+    return few_names([views[i].name for i in suspects(views)])
 
 
 def _told(path, what, reading, cameras):

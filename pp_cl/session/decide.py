@@ -57,9 +57,9 @@ SIDES = {
     0.0: ("tiny", 200),
     1.0: ("small", 400),
     2.0: ("small", 500),
-    5.0: ("small", 667),
-    12.0: ("small", 800),
-    30.0: ("full", 1000),
+    9.0: ("small", 667),
+    20.0: ("small", 800),
+    40.0: ("full", 1000),
 }
 PACE = 650.0  # speed_of() such a machine
 RESAMPLED = 1.15  # images are resampled if they are so many times as large; it blurs them a little

@@ -62,13 +62,14 @@ def sheet_of_masks(
         for disagreement in wrong
         if disagreement.view.name not in left_out
     }
-    for what, shares in (
-        ("lie beside what the other views agree on, and are left out of the training", left_out),
-        ("reject what the other views agree on", rejecting),
-    ):
-        if shares:
-            worst = few_names([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
-            warnings.warn(
-                f"masks {what}: {worst}; see {MASKS_SHEET} in the run's folder", stacklevel=2
-            )
+    told = f"see {MASKS_SHEET} in the run's folder"
+    if left_out:
+        warnings.warn(
+            "cameras or masks contradict the other views, left out of the training:"
+            f" {few_names([*left_out])}; {told}",
+            stacklevel=2,
+        )
+    if rejecting:
+        worst = few_names([f"{name} ({share:.0%} of it)" for name, share in rejecting.items()])
+        warnings.warn(f"masks reject what the other views agree on: {worst}; {told}", stacklevel=2)
     return outline_sheet(dev, views, hull, wrong) if wrong or left_out else None

@@ -151,7 +151,9 @@ def fit_gaussians(
     sRGB colour as the first three features.
     """
     began = time.monotonic()
-    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell, most)  # fitted later
+    # the fit does the rest
+    coefficients = fit_harmonics(run, steps=1 if minutes == math.inf else -1)
+    dev, cloud = run.dev, begun(run, coefficients, cell, most)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:

@@ -158,5 +158,5 @@ def test_a_training_warns_leaves_the_image_and_goes_on_without(scene, tmp_path, 
         assert main(words) == 0
         header, _ = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
         assert header["left_out"] == ["train/r_4.png"] and len(header["views"]) == 24
-    assert "left out of the training: train/r_4.png (" in capsys.readouterr().err
+    assert "left out of the training: train/r_4.png" in capsys.readouterr().err
     assert read_rgba(tmp_path / "run" / "masks.png").shape[1] > 48
