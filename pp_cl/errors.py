@@ -2,8 +2,9 @@
 
 import difflib
 import os
+import shlex
 from collections.abc import Iterable, Sequence
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 
 MOST_LINE = 1000  # characters of a message: two long paths and a reason
@@ -63,10 +64,18 @@ class Stopped(Exception):
 
 
 def require(what: str, *packages: str) -> None:
-    """Raise UserError if one of the packages that `what` needs is not installed."""
-    if any(find_spec(package.replace("-", "_")) is None for package in packages):
-        install = f"`pip install {' '.join(packages)}`"
-        raise UserError(f"{what} needs {' and '.join(packages)}; install with {install}")
+    """Raise UserError if one of the packages that `what` needs cannot be imported."""
+    for package in packages:
+        module = package.replace("-", "_")
+        try:
+            import_module(module)
+        except Exception as error:  # a broken one may raise anything
+            is_missing = isinstance(error, ModuleNotFoundError) and error.name == module
+            broken = "" if is_missing else f" ({package} cannot be imported: {error})"
+            raise UserError(
+                f"{what} needs {' and '.join(packages)}{broken}; install with"
+                f" `pip install {' '.join(packages)}`"
+            ) from None
 
 
 def name_of(folder: Path) -> str:
@@ -92,6 +101,11 @@ def few_names(names: Sequence[str]) -> str:
     """The first names, and the number of the others."""
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more
+
+
+def pasted(path: object) -> str:
+    """A path as a word of a command that people may paste."""
+    return shlex.quote(str(path))
 
 
 def suggestion(word: str, words: Iterable[str]) -> str:

@@ -9,6 +9,15 @@ def test_packages_that_are_missing_are_named_with_what_installs_them():
         require("a test", "numpy", "no-such")
 
 
+@pytest.mark.parametrize("broken", ["raise OSError('no lib.so')", "import not_there"])
+def test_packages_that_cannot_be_imported_are_told_alike(tmp_path, monkeypatch, broken):
+    (tmp_path / "broken_one.py").write_text(broken)
+    monkeypatch.syspath_prepend(tmp_path)
+    told = r"a test needs broken-one \(broken-one cannot be imported: .*(no lib|not_there).*\); ins"
+    with pytest.raises(UserError, match=told):
+        require("a test", "broken-one")
+
+
 def test_what_has_no_end_is_named_by_its_kind():
     deep = []
     for _ in range(100_000):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import begin_with, help_lines, load_config
-from pp_cl.errors import UserError, require
+from pp_cl.errors import UserError, pasted, require
 from pp_cl.presets import PRESETS, SHORT
 
 if TYPE_CHECKING:
@@ -88,8 +88,8 @@ def _train(folder, config, options, follow):
     stored = stored_state(folder, config)
     if stored and is_finished(stored, config):
         print(
-            f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics`"
-            " measures it"
+            f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {pasted(folder)}"
+            " --metrics` measures it"
         )
         return
     dev = open_device(options.device)

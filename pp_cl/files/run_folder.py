@@ -12,7 +12,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from pp_cl.errors import UserError, name_of, shown
+from pp_cl.errors import UserError, name_of, pasted, shown
 from pp_cl.files.atomic import check_ours, is_owned, own, remove_ours, told, write_text
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
@@ -83,7 +83,9 @@ class RunFolder:
                 raise ValueError("infinite values")
             return results
         except Exception as error:  # the file may hold anything
-            raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
+            raise refusal(
+                file, error, "metrics", f"run `pp-cl eval {pasted(self)}` again"
+            ) from None
 
     def check_usable(self) -> None:
         """Raise UserError if the folder is a file, or holds files that belong to no run."""

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, one_line
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, one_line, pasted
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.scene import demo
 from pp_cl.scene.edits import EDITS, Edits, read_edits
@@ -86,7 +86,8 @@ def check_folder(folder: Path) -> None:
     if folder.is_file():
         is_video = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
         mend = f"a scene is a folder, maybe {folder.absolute().parent}"
-        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene from it" if is_video else mend
+        capture = f"`pp-cl capture {pasted(folder)} --out SCENE` makes a scene from it"
+        mend = capture if is_video else mend
         mend = "unpack it and give the folder in it" if folder.suffix.lower() in ARCHIVES else mend
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 
 from pp_cl import open_device
 from pp_cl.engine import evenly, fitting_downscale
-from pp_cl.errors import UserError, few_names
+from pp_cl.errors import UserError, few_names, pasted
 from pp_cl.files import (
     atomic_folder,
     atomic_path,
@@ -189,9 +189,10 @@ class Capture:
             else:
                 is_same = self.source.name == Path(before["source"]).name
             if Path(before["source"]).exists() or not is_same:
+                again = f"pp-cl capture {pasted(self.source)} --out {pasted(self.scene)}"
                 raise UserError(
                     f"{self.scene}: was made from {before['source']}; choose another --out, or"
-                    f" replace it by `pp-cl capture {self.source} --out {self.scene} --from frames`"
+                    f" replace it by `{again} --from frames`"
                 )
             write_json(self._file("options"), before | {"source": self.options["source"]})
             changed.remove("source")

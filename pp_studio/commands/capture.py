@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
     """Run the stages that are not done yet."""
     from pathlib import Path
 
-    from pp_cl.errors import UserError
+    from pp_cl.errors import UserError, pasted
     from pp_studio.capture.stages import Capture
 
     source = Path(options.source)
@@ -86,4 +86,6 @@ def run(options: argparse.Namespace) -> None:
     out, device = Path(options.out), options.device
     capture = Capture(out, given, lambda line: print(line, flush=True), device)
     capture.run(options.begin, replace_masks=options.replace_masks)
-    print(f"look at it with `pp-cl info {options.out} --picture look.png`, then `pp-cl train`")
+    print(
+        f"look at it with `pp-cl info {pasted(options.out)} --picture look.png`, then `pp-cl train`"
+    )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import PRESETS, field_of
-from pp_cl.errors import Stopped, UserError
+from pp_cl.errors import Stopped, UserError, pasted
 from pp_studio.capture import STAGES
 from pp_studio.commands.capture import add_hints
 from pp_studio.export import QUICK
@@ -188,7 +188,8 @@ def run(options: argparse.Namespace) -> None:
             step("render", str(folder), "--out", str(out / video), *words, *device)
         show("", split)
     print(
-        f"wrote {page} in {clock.passed:.1f} minutes; `pp-cl view {folder}` shows the exact model"
+        f"wrote {page} in {clock.passed:.1f} minutes; `pp-cl view {pasted(folder)}` shows the exact"
+        " model"
     )
 
 

@@ -75,9 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--fps",
         type=shared.number(0.1, 240),
-        default=FPS,
         metavar="F",
-        help=f"frames per second ({FPS})",
+        help=f"frames per second ({FPS}, or what a camera_path.json states)",
     )
     add(
         "--background",
@@ -111,10 +110,13 @@ def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them if one is asked for."""
     from pp_cl import fastest, load
     from pp_cl.files import own
+    from pp_cl.scene import read_rate
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
 
     kind = _format(options)
+    stated = read_rate(Path(options.path)) if Path(options.path).suffix else None
+    options.fps = options.fps or stated or FPS
     style, count = _style(options, kind), _frame_count(options, kind)
     if kind in VIDEOS:
         check_video(kind)

@@ -67,7 +67,9 @@ def export_run(
     if name not in FORMATS:
         raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
     path, count, metres = Path(path), run.model.cloud.count, length.metres_per_unit(run)
-    unit = "" if metres == 1 else ", in metres"
+    unit, is_stl = "" if metres == 1 else ", in metres", path.suffix.lower() == ".stl"
+    if name == "mesh" and is_stl and metres != 1:  # which slicers take for millimetres
+        metres, unit = 1000 * metres, ", in millimetres"
     within, turn = None, np.eye(3)
     if box is not None:
         within = np.sort(np.reshape(box, (2, 3)), axis=0)
@@ -88,7 +90,7 @@ def export_run(
     if name == "mesh":
         made = mesh.coloured_mesh(run, within)
         vertices, origin = placed(made.vertices), np.zeros(3)
-        if path.suffix.lower() == ".stl" and vertices.dtype == np.float64:  # STL holds float32
+        if is_stl and vertices.dtype == np.float64:  # STL holds float32
             origin = np.rint(vertices.mean(0))
         write = partial(mesh.write_mesh, path, replace(made, vertices=vertices - origin))
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ""

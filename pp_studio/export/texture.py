@@ -210,29 +210,32 @@ def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def companions(path: Path) -> list[Path]:
-    """The files that a textured OBJ needs beside it: its materials and their texture."""
-    return [path.with_suffix(".mtl"), path.with_suffix(".png")]
+    """The files that a textured OBJ needs beside it: its materials and their texture. Their names
+    have no spaces, at which other programs end a name.
+    """
+    stem = "_".join(path.stem.split())
+    return [path.with_name(f"{stem}.mtl"), path.with_name(f"{stem}.png")]
 
 
 def is_textured(path: Path) -> bool:
     """Whether an OBJ and its materials are there, as export_texture() writes them."""
     materials, texture = companions(path)
     with suppress(OSError, UnicodeDecodeError):
-        return path.exists() and materials.read_text("utf-8") == _materials(path, texture)
+        return path.exists() and materials.read_text("utf-8") == _materials(texture)
     return False
 
 
-def _materials(path, texture):
-    return f"newmtl {path.stem}\nillum 0\nKd 1 1 1\nmap_Kd {texture.name}\n"
+def _materials(texture):
+    return f"newmtl {texture.stem}\nillum 0\nKd 1 1 1\nmap_Kd {texture.name}\n"
 
 
 def _write_obj(path, mesh):
     materials, texture = companions(path)
     image = mesh.visual.material.baseColorTexture
     write_png(texture, np.asarray(image) / np.float32(255))
-    write_text(materials, _materials(path, texture))
+    write_text(materials, _materials(texture))
     near = mesh.copy()
-    near.visual.material = SimpleMaterial(image=image, name=path.stem)
+    near.visual.material = SimpleMaterial(image=image, name=texture.stem)
     text, _ = export_obj(
         near,
         include_normals=True,

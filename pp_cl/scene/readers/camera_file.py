@@ -3,6 +3,7 @@ transforms.json, or the cameras.json of 3D Gaussian Splatting and brush.
 """
 
 import math
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +25,7 @@ FORMATS = (
     "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
     " list)"
 )
+MOST_RATE = 240  # frames a second
 MOST_PIXELS = 2**15  # a side; the pixel boxes of points are 16-bit
 
 
@@ -44,6 +46,8 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
         read, frames, listed, shared = _transforms_camera, data["frames"], "frames", data
     else:
         raise UserError(f"{file}: holds no cameras; give {FORMATS}")
+    if shared.get("crop"):
+        warnings.warn(f"{file}: its crop is not read; all of the object is drawn", stacklevel=2)
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: {listed or 'the list'}: must hold at least one camera")
     cameras = [read(Frame(file, shared, own, i, listed), size) for i, own in enumerate(frames)]
@@ -51,6 +55,15 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
         if np.linalg.det(camera.pose[:, :3]) < 0:
             raise UserError(f"{file}: {listed}[{i}]: its axes are left-handed; mirror them back")
     return cameras
+
+
+def read_rate(file: Path) -> float | None:
+    """The frames per second that a camera_path.json states; None if the file states none. Raises
+    UserError for a file that cannot be read.
+    """
+    data = read_json(file) if file.is_file() else None
+    rate = data.get("fps") if isinstance(data, dict) and "camera_path" in data else None
+    return float(rate) if type(rate) in (int, float) and 0 < rate <= MOST_RATE else None
 
 
 def _transforms_camera(frame, size):

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl.engine.camera import Camera
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, pasted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import UTF_16, opened_regular, refusal
 from pp_cl.scene.found import (
@@ -118,8 +118,8 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
     undistort = (
-        f"is not read; convert with `colmap image_undistorter --image_path {folder / IMAGES}"
-        f" --input_path {model} --output_path NEW` and give NEW"
+        "is not read; convert with `colmap image_undistorter --image_path"
+        f" {pasted(folder / IMAGES)} --input_path {pasted(model)} --output_path NEW` and give NEW"
     )
     for identity, lens in lenses.items():
         if isinstance(lens, Lens) and lens.model in NOT_READ:

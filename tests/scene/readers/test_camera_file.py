@@ -5,7 +5,7 @@ import pytest
 from support.scenes import ring_cameras
 
 from pp_cl.errors import UserError
-from pp_cl.scene.readers.camera_file import read_cameras
+from pp_cl.scene.readers.camera_file import read_cameras, read_rate
 
 CAMERAS = ring_cameras(3, 64)
 TO_GL = np.diag([1, -1, -1, 1])
@@ -55,6 +55,17 @@ CONTENTS = {
         "camera_path": [path_camera(camera) for camera in CAMERAS],
     },
 }
+
+
+def test_a_path_states_its_rate(tmp_path):
+    file, content = tmp_path / "path.json", CONTENTS["camera_path.json"]
+    for rate, expected in ((24, 24.0), (None, None), ("24", None), (-1, None)):
+        file.write_text(json.dumps(content | {"fps": rate}))
+        assert read_rate(file) == expected
+    file.write_text(json.dumps(content | {"crop": {"crop_scale": [1, 1, 1]}}))
+    with pytest.warns(UserWarning, match="its crop is not read"):
+        read_cameras(file)
+    assert read_rate(tmp_path / "none.json") is None
 
 
 @pytest.mark.parametrize("name", CONTENTS)

@@ -70,7 +70,7 @@ def test_another_host_warns_and_one_that_is_not_ours_is_refused(begun, capsys):
 
 
 def test_without_viser_the_first_line_says_so(begun, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pp_cl.errors.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "viser", None)
     assert "pip install viser" in failure("view", begun)
     train = arguments(str(tmp_path / "ball"), tmp_path / "new", train__iterations=3)
     assert main([*train, "--view"]) == 2

@@ -73,6 +73,10 @@ def test_exports_are_in_metres(mine, tmp_path, name):
     stored = json.loads((mine.folder.path / "length.json").read_text())
     assert stored["between"] == [first, second] and stored["metres"] == 0.24
     assert export_run(mine, name, tmp_path / "c.ply").endswith(", in metres")
+    if name == "mesh":  # slicers take the numbers of an STL for millimetres
+        assert export_run(mine, name, tmp_path / "c.stl").endswith(", in millimetres")
+        wide = trimesh.load(tmp_path / "c.stl").extents
+        assert wide == pytest.approx(1000 * np.asarray(spans(tmp_path / "d.ply")), rel=1e-3)
 
 
 def test_what_tells_no_length_is_refused(mine):

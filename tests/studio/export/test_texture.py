@@ -73,12 +73,13 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
 
 def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
-    path = tmp_path / "a.obj"
+    path = tmp_path / "a b.obj"  # other programs end a name at a space
     line = export_run(run, "textured", path)
     export_run(run, "textured", tmp_path / "a.glb")
     assert line.endswith("with its .mtl and .png")
-    assert {file.name for file in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png", "a.glb"}
-    obj, glb_mesh = (trimesh.load(tmp_path / name, force="mesh") for name in ("a.obj", "a.glb"))
+    assert {file.name for file in tmp_path.iterdir()} == {"a b.obj", "a_b.mtl", "a_b.png", "a.glb"}
+    assert {"mtllib a_b.mtl", "usemtl a_b"} < {*path.read_text().splitlines()}
+    obj, glb_mesh = (trimesh.load(tmp_path / name, force="mesh") for name in ("a b.obj", "a.glb"))
     assert obj.triangles == pytest.approx(glb_mesh.triangles, abs=1e-5)
     uv = [mesh.visual.uv[mesh.faces] for mesh in (obj, glb_mesh)]
     assert uv[0] == pytest.approx(uv[1], abs=1e-5)
@@ -90,11 +91,11 @@ def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     materials, _ = companions(path)
     before = materials.read_text()
     materials.write_text("newmtl mine\n")
-    with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
+    with pytest.raises(UserError, match=r"a_b\.(mtl|png): pp-cl did not write this"):
         check_target("textured", run.folder.path, path)
     materials.write_text(before)
     path.unlink()  # its companions may be a user's now
-    with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
+    with pytest.raises(UserError, match=r"a_b\.(mtl|png): pp-cl did not write this"):
         check_target("textured", run.folder.path, path)
     for file in companions(path):
         file.unlink()
