@@ -314,7 +314,8 @@ def agreement_of(
     does.
     """
     if not any(view.has_mask for view in views):
-        kept, left_out = _without_suspects(views)
+        # with a box, views need not show one place
+        kept, left_out = _without_suspects(views) if box is None else (list(views), {})
         return Agreement(kept, left_out, 0), Beside(0.0, 0.0)
     most = int(MOST_LEFT_OUT * len(views))
     kept, left_out = list(views), dict[str, float]()

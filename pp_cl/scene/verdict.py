@@ -63,7 +63,8 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     reading = None if has_masks or axes else other_axes(cameras, find_reader(path).STATES)
     if reading:
         raise WrongCameras(_told(path, "its cameras do not look at one place", reading, cameras))
-    if not has_masks and axes != STATED and (names := _suspected(kept)):
+    may_judge = not has_masks and box is None and axes != STATED
+    if may_judge and (names := _suspected(kept)):
         raise WrongCameras(f"{path}: {names}: their cameras contradict the others; correct them")
     whole = beside
     if box is not None and beside.strictly > MOST_BESIDE:  # the box may cut the object off

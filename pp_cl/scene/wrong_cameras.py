@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.views import MASK_THRESHOLD, View, border
+from pp_cl.engine.views import MASK_THRESHOLD, View, border, evenly
 
 MOST = 1 / 8  # of the views may be wrong, rounded up; more are named, and the scene is refused
 SIDE = 128  # pixels along the longer side of the masks that are compared, about
@@ -205,7 +205,7 @@ def looking_away(views: Sequence[View]) -> list[int]:
     if len(views) < FEWEST:
         return []
     cameras = [view.camera for view in views]
-    n, eyes = len(cameras), np.stack([camera.eye for camera in cameras])
+    compared, eyes = evenly(cameras, MANY), np.stack([camera.eye for camera in cameras])
     axes = np.stack([camera.pose[:, 2] for camera in cameras])
     radii = np.array([math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in cameras])
     centre, _, distance = consensus(eyes, axes, radii)
@@ -216,8 +216,8 @@ def looking_away(views: Sequence[View]) -> list[int]:
         pixels = np.stack(np.meshgrid(across * camera.width, across * camera.height), -1)
         towards = _directions(camera, pixels.reshape(-1, 2))
         places = (eyes[i] + depths[:, None, None] * towards).reshape(-1, 3)
-        others = [other.pixels(places)[2] for j, other in enumerate(cameras) if j != i]
-        together = np.sum(others, axis=0).max() / (n - 1)
+        others = [other for other in compared if other is not camera]
+        together = np.sum([other.pixels(places)[2] for other in others], axis=0).max() / len(others)
         is_shown = bool(camera.pixels(centre[None])[2][0])
         share = distance[i] / usual
         if together < LEAST_TOGETHER or share > AWAY or share < (AT_IT if is_shown else INSIDE):

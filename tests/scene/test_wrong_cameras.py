@@ -90,3 +90,5 @@ def test_without_masks_cameras_are_judged_by_what_they_show(session_device, view
     agreement, _ = agreement_of(session_device, wrong)
     assert {*agreement.left_out} == {views[4].name, views[17].name}
     assert not looking_away(opaque)
+    boxed, _ = agreement_of(session_device, wrong, np.array([[-1.0] * 3, [1.0] * 3]))
+    assert len(boxed.views) == COUNT, "with a box, views need not show one place"
