@@ -162,11 +162,15 @@ def test_a_scene_without_hull_has_an_image(tmp_path, facts, capsys):
     pixels[..., 3] = 0
     pixels[2:5, 2:5, 3] = 255
     Image.fromarray(pixels).save(last)
-    info = facts(scene, "--picture", tmp_path / "sheet.png")
+    words = ["info", str(scene), "--picture", str(tmp_path / "sheet.png")]
+    assert main([*words, "--json"]) == 2, "as a training, which says the same"
+    told = capsys.readouterr()
+    info = json.loads(told.out)
     assert info["hull"] is None and "the mask rejects every place" in info["problem"]
+    assert info["problem"] in told.err
     image = read_rgba(tmp_path / "sheet.png")[..., :3]
     assert not (image == OUTLINE).all(-1).any()
-    assert main(["info", str(scene)]) == 0
+    assert main(["info", str(scene)]) == 2
     assert "hull        none: " in capsys.readouterr().out
     for path in (*others, last):
         Image.open(path).convert("RGB").save(path)

@@ -63,7 +63,7 @@ def read_rate(file: Path) -> float | None:
     """
     data = read_json(file) if file.is_file() else None
     rate = data.get("fps") if isinstance(data, dict) and "camera_path" in data else None
-    return float(rate) if type(rate) in (int, float) and 0 < rate <= MOST_RATE else None
+    return float(rate) if isinstance(rate, (int, float)) and 0 < rate <= MOST_RATE else None
 
 
 def _transforms_camera(frame, size):
