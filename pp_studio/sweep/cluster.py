@@ -70,7 +70,7 @@ def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dic
             run = train_scene(
                 job.scene,
                 job.folder,
-                job.preset,
+                job.preset or "tiny",  # by minutes, runs beside each other would differ
                 device,
                 settings={key: text for key, text, _ in job.given},
                 is_stopped=is_stopped,
