@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pp_cl.errors import UserError, quoted, shown, suggestion
+from pp_cl.errors import UserError, one_line, quoted, shown, suggestion
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import IMAGE_SIZES, PRESETS
@@ -205,7 +205,8 @@ def load_config(path: Path | str) -> Config:
         raise broken(f"not settings but {quoted(stored, 40)}")
     number, name = stored.pop("format", None), stored.pop("preset", None)
     before = stored.pop("automatic", [])  # of 0.4.0: a list of keys
-    decisions = stored.pop("decisions", {str(key): "decided by 0.4.0" for key in before})
+    before = {str(key): "decided by 0.4.0" for key in before} if type(before) is list else before
+    decisions = stored.pop("decisions", before)
     if type(number) is not int or number != FORMAT:
         raise UserError(
             f"{path}: format is {quoted(number, 40)}, but this version reads {FORMAT}; start a new"
@@ -223,7 +224,8 @@ def load_config(path: Path | str) -> Config:
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is not a section of settings")
         by_key |= {f"{section}.{key}": value for key, value in values.items()}
-    config, by_key = Config(name, decisions), ADDED | by_key
+    reasons = {key: one_line(why) for key, why in decisions.items()}
+    config, by_key = Config(name, reasons), ADDED | by_key
     for key, section, item in every_setting(config):
         if key not in by_key:
             raise broken(f"{key} is missing")

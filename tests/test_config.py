@@ -111,6 +111,7 @@ def stored_settings():
 
 VALUES = {
     "format": [5, 0, True, "1", None],
+    "decisions": [[], 3, None, {"no.key": "why"}, {"train.ema": 4}, {"train.ema": ["why"]}],
     "train.iterations": [True, "60", 60.5, 10**400, None, 0],
     "train.ema": [1, "true"],
     "train.smooth_l1": [float("nan"), float("inf")],
@@ -137,6 +138,19 @@ def test_a_stored_value_of_another_kind_is_refused(tmp_path, key):
             stored[section] = value
         path.write_text(json.dumps(stored))
         assert key in refusal(path)
+
+
+def test_reasons_are_one_line_and_keys_of_older_runs_are_read(tmp_path):
+    path, stored = tmp_path / "config.json", stored_settings()
+    path.write_text(json.dumps(stored | {"decisions": {"train.ema": "a\x1b[31m\n" * 10**3}}))
+    (why,) = load_config(path).decisions.values()
+    assert why.isprintable() and len(why) <= 1000
+    del stored["decisions"]
+    path.write_text(json.dumps(stored | {"automatic": ["train.refine_at"]}))
+    assert [*load_config(path).decisions] == ["train.refine_at"]
+    for broken in (7, None, "train.refine_at", [["a"]], ["no.key"]):
+        path.write_text(json.dumps(stored | {"automatic": broken}))
+        assert "decisions are" in refusal(path)
 
 
 @pytest.mark.parametrize("section", ["scene", "points", "raster", "network", "train"])

@@ -93,8 +93,8 @@ def _run_rows(facts):
         rows.append(("", f"{facts['seconds']:.1f} s{where}"))
     if facts["psnr"] is not None:
         rows.append(("", f"PSNR {facts['psnr']:.2f} in the last logged step"))
-    rows += [("decisions", why) for why in facts["decisions"].values()][:1]
-    rows += [("", why) for why in facts["decisions"].values()][1:]
+    for i, why in enumerate(facts["decisions"].values()):
+        rows.append(("" if i else "decisions", why))
     network = facts["network"]
     widths = ", ".join(map(str, network["widths"]))
     shape = f"{widths} channels, {network['blocks']} blocks"

@@ -48,8 +48,8 @@ class WrongCameras(UserError):
 
 def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreement, float]:
     """(agreeing() of a scene's training views, the share of their masks beside the hull). Raises
-    WrongCameras if cameras cannot be right, judged by masks or, without masks, by where they look;
-    raises UserError as agreeing() does.
+    WrongCameras if cameras cannot be right, judged by masks or, without masks, by where they look,
+    and where agreement_of() finds no hull.
     """
     path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes

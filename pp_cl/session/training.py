@@ -60,11 +60,10 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """Facts about a new training's hull. seconds: time of carving. forgiven: how many masks may
-    reject a point. sheet: an image of the masks that disagree with the others, None if all agree.
+    """Facts about a new training's hull. forgiven: how many masks may reject a point. sheet: an
+    image of the masks that disagree with the others, None if all agree.
     """
 
-    seconds: float
     forgiven: int
     sheet: np.ndarray | None
 
@@ -344,12 +343,10 @@ def open_training(
         views = [view for view in views if view.name not in left_out]
         info["initial_points"] = header["initial_points"]
     else:
-        start = time.perf_counter()
         with Progress("carving the visual hull"):
             config, agreement, hull, depth_range = decide(dev, config, views, memory)
-            seconds = time.perf_counter() - start
             sheet = sheet_of_masks(dev, views, hull, agreement)
-            facts = HullFacts(seconds, agreement.forgiven, sheet)
+            facts = HullFacts(agreement.forgiven, sheet)
         cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
         model = Model(dev, hull.grid, depth_range, cloud, net=net)
         views, left_out = agreement.views, list(agreement.left_out)
