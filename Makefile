@@ -19,7 +19,7 @@ OCLGRIND = $(wildcard $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
 ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_DATA_RACES=1 OCLGRIND_UNINITIALIZED=1 \
-	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static -DREAD_AHEAD=(void)" PYOPENCL_NO_CACHE=1 \
+	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
 .PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme figures network dist oclgrind gpu-check fuzz bits faults test-coarse test-gpu-form clean

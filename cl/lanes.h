@@ -31,15 +31,12 @@
 
 // Asks for what lies at a global address before it is read, on CPUs, where walks over points wait
 // mostly for what lies anywhere in memory. They look so many points ahead.
-// A simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
+// READS_AHEAD: the driver is one that can (pp_cl/engine/device/quirks.py).
 #define POINTS_AHEAD 8
-#if ON_CPU && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
-#if __has_builtin(__builtin_prefetch)
+#if ON_CPU && defined(READS_AHEAD)
 // through a number, since its argument is a pointer to private memory
 #define READ_AHEAD(address) __builtin_prefetch((const void *)(uintptr_t)(address))
-#endif
-#endif
-#ifndef READ_AHEAD
+#else
 #define READ_AHEAD (void)
 #endif
 

@@ -86,6 +86,8 @@ def program(argv: Sequence[str] | None = None) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     warnings.showwarning = _show_warning
+    # what commands tell is not for Python's filters, which may hide it or make an error of it
+    warnings.filterwarnings("default", category=UserWarning, module=r"pp_(cl|studio)\b")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # for characters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")

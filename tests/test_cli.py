@@ -1,7 +1,9 @@
 import json
+import shutil
 import signal
 import subprocess
 import sys
+import warnings
 from textwrap import dedent
 
 import numpy as np
@@ -23,6 +25,17 @@ def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
     monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     for words in (["train", scene, "--out", tmp_path / "run"], ["devices"]):
         assert "install" in failure(*words)
+
+
+@pytest.mark.parametrize("action", ["ignore", "error"])
+def test_what_is_told_is_for_no_filter_of_pythons(runs, tmp_path, capsys, action):
+    """Notebooks and images of Docker set PYTHONWARNINGS."""
+    folder = shutil.copytree(runs.ball(views=12, size=32), tmp_path / "scene")
+    sorted((folder / "train").iterdir())[0].write_bytes(b"no image")
+    with warnings.catch_warnings():
+        warnings.simplefilter(action)
+        assert main(["info", str(folder)]) == 0
+    assert "views left out" in capsys.readouterr().err
 
 
 def test_without_a_command_the_help_is_printed(capsys):

@@ -4,6 +4,7 @@ import io
 import posixpath
 import warnings
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,6 +20,8 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF")  # JPEG also opens the MPO of phones
 # endings of the files that read_rgba() reads; formats that may have alpha come first
 ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", ".bmp", ".exr")
+# A profile is sRGB's if it moves none of PROBED**3 colours by more than AS_SRGB levels of 255.
+PROBED, AS_SRGB = 6, 4
 # Pillow's names of the modes that convert to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 # Pillow's names of the modes that are converted to these first: inks, video, premultiplied alpha
@@ -76,13 +79,25 @@ def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
         )
     if (profile := image.info.get("icc_profile")) and image.mode in ("RGB", "RGBA", "CMYK"):
         with suppress(ImageCms.PyCMSError, OSError):  # ignores a broken profile
-            known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-            if "srgb" not in ImageCms.getProfileDescription(known).lower():
-                mode = "RGBA" if image.mode == "RGBA" else "RGB"
-                srgb = ImageCms.createProfile("sRGB")
-                image = ImageCms.profileToProfile(image, known, srgb, outputMode=mode) or image
+            if image.mode == "CMYK" or not _is_srgb(profile):
+                image = _from_profile(image, profile)
                 _tell(path, "images with a colour profile of their own are read as sRGB")
     return image.convert(CONVERTED[image.mode]) if image.mode in CONVERTED else image
+
+
+@lru_cache(maxsize=16)
+def _is_srgb(profile):
+    """Whether a profile leaves RGB as it is, whatever its name says."""
+    levels = np.linspace(0, 255, PROBED).round().astype(np.uint8)
+    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(1, -1, 3)
+    converted = np.array(_from_profile(Image.fromarray(probe), profile), int)
+    return bool(np.abs(converted - probe).max() <= AS_SRGB)
+
+
+def _from_profile(image, profile):
+    mode = "RGBA" if image.mode == "RGBA" else "RGB"
+    known, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+    return ImageCms.profileToProfile(image, known, srgb, outputMode=mode) or image
 
 
 def _tell(path, what):

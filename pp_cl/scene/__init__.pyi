@@ -26,6 +26,7 @@ from .masks import named_mask as named_mask
 from .masks import read_mask_of_size as read_mask_of_size
 from .readers.camera_file import read_cameras as read_cameras
 from .readers.camera_file import read_rate as read_rate
+from .readers.common import HELD_OUT as HELD_OUT
 from .readers.common import read_json as read_json
 from .readers.frame import frame_keys as frame_keys
 from .readers.transforms import write_scene as write_scene

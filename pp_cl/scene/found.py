@@ -19,7 +19,7 @@ from urllib.parse import unquote
 from pp_cl.errors import Unusable, UserError, few_names, quoted
 from pp_cl.files.atomic import sha256_of
 from pp_cl.files.image import ENDINGS
-from pp_cl.files.untrusted import read_json_text
+from pp_cl.files.untrusted import read_json_text, read_regular, refusal
 
 # folders in which programs put images, in the order of the search; images_2, images_4 ... follow
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
@@ -30,10 +30,17 @@ CODE_PAGES = ("gb18030", "cp932", "big5", "cp949", "cp1251", "cp1252", "cp437", 
 # how many folders, and how deep, are searched for models, and for scenes inside other folders
 MOST_FOLDERS, MOST_DEPTH = 200, 6
 MOST_JSON = 2**24  # bytes of a file that may be a transforms.json
+MOST_LIST = 2**24  # bytes of a list of images
 # {file of a program or dataset whose format pp-cl cannot read: which export it can read}
 EXPORTS = {
     "*.xml": 'perhaps Metashape\'s; use its Export Cameras with the type "Colmap"',
     "*.csv": "perhaps RealityCapture's; export its registration for COLMAP",
+    "*.sfm": "Meshroom's; write COLMAP's files with `aliceVision_exportColmap`",
+    "sfm.abc": "Meshroom's; write COLMAP's files with `aliceVision_exportColmap`",
+    "sfm_data*": "OpenMVG's; write COLMAP's files with `openMVG_main_openMVG2Colmap`",
+    "reconstruction.json": "perhaps OpenSfM's; write COLMAP's files with `opensfm export_colmap`",
+    "*.nvm": "VisualSFM's, which is not read; `pp-cl capture` finds the cameras of photographs",
+    "bundle*.out": "Bundler's, which is not read; `pp-cl capture` finds the cameras of photographs",
     "cams/*_cam.txt": "BlendedMVS's; use its scenes as NeuS ships them, with cameras_sphere.npz",
     "keyframes/*cameras/*.json": "Polycam's; make a transforms.json with `ns-process-data polycam`",
     "metadata.json": "perhaps Record3D's; make a transforms.json with `ns-process-data record3d`",
@@ -96,6 +103,35 @@ def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str
     elif _bytes(given):
         text += "; or give the images ASCII names, as the name is not UTF-8"
     raise Unusable(fail(text), f"no {kind}")
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """The file in a folder that a name in any of its _spellings() means: the same name, or the only
+    one alike; the folder's `name` if there is none.
+    """
+    file = folder / name
+    if file.exists() or not folder.is_dir():
+        return file
+    alike = [other for other in sorted(os.listdir(folder)) if _keys(other) & _keys(name)]
+    return folder / alike[0] if len(alike) == 1 else file
+
+
+def listed_in(file: Path, images: Sequence[str]) -> set[str]:
+    """The images that the lines of a text file mean, by their paths in the folder of images or by
+    their last parts, with or without an ending. Raises UserError for a file that is not text, is
+    too long, or names none.
+    """
+    try:
+        lines = read_regular(file, MOST_LIST, "utf-8-sig").split("\n")
+    except (OSError, ValueError) as error:
+        raise refusal(file, error, "text") from None
+    paths = (_in_tree(line.strip().replace("\\", "/")) for line in lines)
+    wanted = {key for path in paths for key in _keys(_bare(path))}
+    bare = {image: _bare(image) for image in images}
+    named = {i for i in images if (_keys(bare[i]) | _keys(posixpath.basename(bare[i]))) & wanted}
+    if not named:
+        raise UserError(f"{file}: names no image of the scene; correct or remove it")
+    return named
 
 
 def pictures_of(files: Sequence[Path]) -> list[object]:

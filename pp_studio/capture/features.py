@@ -229,6 +229,34 @@ def forget_focal_lengths(database: Path) -> bool:
     return bool(cameras)
 
 
+def with_zooms(database: Path, images: Path, copy: Path, zooms: dict[str, int]) -> None:
+    """Write a copy of the database in which photographs of another zoom have another lens, and
+    check its pairs anew. zooms: {image: the number of its zoom}.
+    """
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
+        stored = sorted(db.read_all_images(), key=lambda image: image.name)
+        ids, lenses = {}, {(image.camera_id, zooms[image.name]) for image in stored}
+        with colmap.Database.open(copy) as new:
+            for number, zoom in sorted(lenses):
+                of_lens = [i for i in stored if (i.camera_id, zooms[i.name]) == (number, zoom)]
+                names = [image.name for image in of_lens]
+                options = colmap.ImageReaderOptions(camera_model=LENS)
+                lens = db.read_camera(number)
+                options.camera_params = ",".join(map(str, lens.params))
+                colmap.import_images(copy, images, colmap.CameraMode.SINGLE, names, options)
+                for image in of_lens:
+                    twin = new.read_image_with_name(image.name)
+                    ids[image.image_id] = twin.image_id
+                    new.write_keypoints(twin.image_id, db.read_keypoints(image.image_id))
+                twin = new.read_camera(twin.camera_id)
+                twin.has_prior_focal_length = False
+                new.update_camera(twin)
+            for pair, matches in zip(*db.read_all_matches(), strict=True):
+                two = [ids[i] for i in colmap.pair_id_to_image_pair(pair)]
+                new.write_matches(*two, matches)
+            _verify_anew(colmap, copy, new)
+
+
 def verification(colmap: Any) -> Any:
     """Options for checking pairs, with a seed, so that the same matches give the same pairs."""
     options = colmap.TwoViewGeometryOptions()

@@ -6,7 +6,8 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -40,7 +41,8 @@ ENDINGS = (
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
 COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
-FOCAL, FOCAL_35 = 0x920A, 0xA405  # tags in the part of EXIF about the exposure
+# tags in the part of EXIF about the exposure; phones crop and enlarge, and may state only ZOOM
+FOCAL, FOCAL_35, ZOOM = 0x920A, 0xA405, 0xA404
 # tags there, too: pixels across and down, pixels per unit, the unit
 SENSOR = (0xA002, 0xA003, 0xA20E, 0xA210)
 PER_MM = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres in a unit
@@ -49,6 +51,7 @@ POSSIBLE = 0.2, 20.0  # focal lengths, in longer sides of the image
 QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
 LEAST = 8  # photographs
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")  # of cameras
+OTHERS = (".jxl", ".jp2", ".j2k", ".psd", ".exr", ".hdr", ".insp")  # pictures that are not read
 DIGITS = 6  # to which numbers in names are padded, so that 10 follows 9
 SEEN, SMALL = 640, 64  # longer side, pixels, at which sharpness and likeness are measured
 BLURRED = 0.2  # share of the neighbours' median sharpness below which an image is blurred
@@ -58,6 +61,7 @@ ALIKE = 0.15  # share of the neighbours' usual difference below which images are
 SAME = 0.3  # levels of 255: small copies of the same photograph differ by less
 DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes to decode a pixel, and for all decoding at once
 FRAMES, GROUP = 120, 12  # frames taken from a video; frames in a group of the filter
+WHOLE_SHARE = 0.9  # of the frames that a video states, or it was cut off
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # so that a video cannot name another machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
 # Interlaced frames, which many videos do not declare, are recognised by their content and lose the
@@ -108,11 +112,13 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
 def _photographs(folder, images):
     """Yield the facts of each photograph, raw ones too; write readable ones to `images`."""
     needed("pillow_heif").register_heif_opener()
-    files = listed(folder)
+    files, unread = listed(folder), listed(folder, _is_unread)
     if not files:
+        kinds = ", ".join(sorted({file.suffix.lower() for file in unread}))
+        why = f", and {kinds} are not read: write JPEGs of them" if unread else ""
         raise UserError(
-            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
-            " or a video"
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}){why}; give the folder that has"
+            " them, or a video"
         )
     stems = [file.relative_to(folder).with_suffix("").as_posix() for file in files]
     if sorted(stems) != stems:  # 10 after 9: matching takes neighbours by name
@@ -126,17 +132,34 @@ def _photographs(folder, images):
             name += "_"
         taken.add(name.lower())
         targets.append(images / name)
-    with ThreadPoolExecutor(_threads(max(map(_pixels, files)))) as pool:
+    with ThreadPoolExecutor(_threads(max(_pixels(file) or 1 for file in files))) as pool:
         made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
         yield from track(made, "frames", "image", len(files))
-    for file in listed(folder, RAW):
-        source = file.relative_to(folder).as_posix()
-        yield {"source": source, "reason": f"is raw ({file.suffix}): write JPEGs of it"}
+    for file in unread:
+        what = "is raw" if file.suffix.lower() in RAW else "is of a kind that is not read"
+        reason = f"{what} ({file.suffix}): write JPEGs of it"
+        yield {"source": file.relative_to(folder).as_posix(), "reason": reason}
 
 
-def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
-    """The photographs in a folder and its subfolders, in the order of their names, 10 after 9.
-    Hidden files are left out, and so are folders of masks and folders that pp-cl fills.
+def _is_photograph(file):
+    """Whether a file's name or its first bytes are a photograph's."""
+    if file.suffix.lower() in ENDINGS:
+        return True
+    if _is_unread(file):  # raw photographs begin as TIFF does
+        return False
+    needed("pillow_heif").register_heif_opener()
+    return _pixels(file) is not None
+
+
+def _is_unread(file):
+    """Whether a file's name is that of a picture that is not read."""
+    return file.suffix.lower() in (*RAW, *OTHERS)
+
+
+def listed(folder: Path, is_listed: Callable[[Path], bool] = _is_photograph) -> list[Path]:
+    """The photographs in a folder and its subfolders, by their names or contents, in the order of
+    their names, 10 after 9. Hidden files are left out, and so are folders of masks and folders that
+    pp-cl fills. is_listed: lists other files.
     """
     paths = []
     for place, folders, files in os.walk(folder):
@@ -145,7 +168,7 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
-        paths += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
+        paths += [here / f for f in files if f[0] != "." and is_listed(here / f)]
 
     def natural(file):
         name = file.relative_to(folder).as_posix()
@@ -156,12 +179,12 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
 
 
 def _pixels(file):
-    """The pixels of an image, by its header; 1 if it cannot be read."""
+    """The pixels of an image, by its header; None if it cannot be read."""
     try:
         with opened_regular(file) as opened:
             return math.prod(Image.open(opened, formats=FORMATS).size)
     except Exception:  # decoders raise all kinds of exceptions on broken bytes
-        return 1
+        return None
 
 
 def _threads(most):
@@ -220,6 +243,7 @@ def _lens(exif):
     wanted = (FOCAL, FOCAL_35, *SENSOR)
     copied.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
     lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
+    lens += [f"zoom {zoom}"] if (zoom := exposure.get(ZOOM)) not in (None, 0, 1) else []
     return " ".join(shown(str(part), 40) for part in lens), copied.tobytes()
 
 
@@ -255,7 +279,7 @@ def _sharpest(video):
     """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
     frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
-    # an estimate, only for the bar: videos that browsers record state no length
+    # an estimate: videos that browsers record state no length
     total = round(meta["duration"] * meta["fps"]) or None
     sharpness, pictures, shown = [], [], None  # pictures: each frame's number among distinct ones
     for frame in track(frames, "looking at frames", "frame", total):
@@ -267,6 +291,9 @@ def _sharpest(video):
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
     # repeated frames, as in videos with a constant rate, do not lengthen an interval
+    if total and len(sharpness) < WHOLE_SHARE * total:
+        what = f"only {len(sharpness)} of its {total} frames are there; copy it again for the rest"
+        warnings.warn(f"{video}: {what}", stacklevel=1)
     count = max(pictures[-1] + 1, FRAMES)
     intervals = groupby(range(len(pictures)), lambda number: pictures[number] * FRAMES // count)
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)

@@ -3,17 +3,19 @@ no place.
 """
 
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pp_cl import Camera, Progress
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_folder
 from pp_cl.scene import ImageFile, LensDistortion
-from pp_studio.capture.features import cores, forget_focal_lengths, quiet
+from pp_studio.capture.features import cores, forget_focal_lengths, quiet, with_zooms
 from pp_studio.capture.packages import needed
 
 LEAST_SHARE = 0.5  # share of the images that must have a place
@@ -32,6 +34,11 @@ SAME_BEST, SAME_POINT = 0.75, 0.25
 # by this share: of the demo, whose lens is straight, it does by 0.005, of a museum's head by 0.017.
 DISTORTS = 0.01
 BELIEVED = 2.0  # median errors of the points: observations with larger errors count less
+# A lens for each image is tried if the focal length of any, with the points fixed, would differ by
+# NEAR, in logarithms; zooms of LEAST_ZOOMED images or more are ZOOMED apart, of fewer LONE_ZOOMED,
+# and they lower the reprojection error by ZOOM_HELPS.
+NEAR, ZOOMED, LONE_ZOOMED, ZOOM_HELPS, LEAST_ZOOMED = 0.02, 0.05, 0.25, 0.05, 3
+ADJUSTED = 10  # steps of an image's own focal length
 CONVERGED = 1e-5  # relative change of the sum of errors
 MOST_ERROR = 20.0  # pixels of mean reprojection error
 BLURRED = 0.4  # of the median sharpness
@@ -45,9 +52,9 @@ def place(
     taken: take_images()'s facts about the images. turns: the object turns before a fixed camera,
     and all matches are on the object; if few images fit in this way, they are placed as usual.
     Returns the numbers of images and points, the reprojection error in pixels, {image: reason} for
-    images without a place, and the images of a turned object that have a place by weak pairs alone.
-    Raises UserError if these are more than half, and if the cameras
-    around a turned object contradict the matches.
+    images without a place, half a sentence on focal lengths that differ, and the images of a turned
+    object that have a place by weak pairs alone. Raises UserError if images without a place are
+    more than half, and if the cameras around a turned object contradict the matches.
     """
     least = max(3, LEAST_SHARE * len(taken))
 
@@ -82,9 +89,16 @@ def place(
             with Progress("refining all poses"):
                 best = _refined_turned(best) if turns else refine(best)
             if (error := best.compute_mean_reprojection_error()) < MOST_ERROR:
-                best.write(unfinished)
                 break
             candidates.pop()  # its optimisation failed
+        zoomed, of_model = "", database
+        if candidates and may_be_zoomed(best):
+            copy, names = unfinished / "zooms.db", [image["name"] for image in taken]
+            other = _with_zooms(database, images, copy, names, turns)
+            if other and other.num_reg_images() >= best.num_reg_images():
+                less = other.compute_mean_reprojection_error()
+                if best.num_reg_images() < least or less < (1 - ZOOM_HELPS) * error:
+                    best, error, of_model, zoomed = other, less, copy, _zoom_line(other)
         placed = (
             {image.name for image in best.images.values() if image.has_pose} if candidates else ()
         )
@@ -96,7 +110,10 @@ def place(
                 " take more of them with more overlap (10 degrees apart or less), sharp and of an"
                 " object that has some texture"
             )
-        if turns and (wrong := contradictions(database, best)):
+        wrong = contradictions(of_model, best) if turns else []
+        (unfinished / "zooms.db").unlink(missing_ok=True)
+        best.write(unfinished)
+        if wrong:
             raise UserError(
                 f"{images}: {wrong[0][0]} and {wrong[0][1]} show the same side of the object, but"
                 " not from the places that were found, so that cameras are wrong; turn the object"
@@ -108,6 +125,7 @@ def place(
             "points": best.num_points3D(),
             "error": round(error, 3),
             "unplaced": reasons,
+            "zoomed": zoomed,
             "weak": _weak(database, placed) if turns else [],
         }
 
@@ -154,6 +172,98 @@ def _mapped(database, images, folder, count, share=None, begun=None):
                 database, images, folder, options, next_image_callback=bar.update, **begin
             )
             return list(models.values())
+
+
+def may_be_zoomed(model: Any) -> bool:
+    """Whether any image of pycolmap's model would fit better with another focal length."""
+    ratios = [_focal_ratio(model, image) for image in _placed(model)]
+    return bool(np.abs(np.log(ratios)).max() > NEAR)
+
+
+def _with_zooms(database, images, copy, names, turns):
+    """pycolmap's model of the images with these names, whose lenses are as many as they have focal
+    lengths; None if that is one. copy: where the database of the model is written.
+    """
+    work, best, number = copy.with_suffix(""), None, {name: i for i, name in enumerate(names)}
+    while True:  # a lens for each image tells which have the same
+        copy.unlink(missing_ok=True)
+        with_zooms(database, images, copy, number)
+        work.mkdir()
+        models = (_mapped_turned if turns else _mapped)(copy, images, work, len(names))
+        shutil.rmtree(work)
+        best = max(models, key=lambda model: model.num_reg_images(), default=None)
+        if best is None:
+            return None
+        with Progress("refining all poses"):
+            best = _refined_turned(best) if turns else refine(best)
+        fewer = zooms_of(best, names)
+        if fewer is None or len({*fewer.values()}) == len({*number.values()}):
+            return best if fewer else None
+        number = fewer
+
+
+def zooms_of(model: Any, names: Sequence[str]) -> dict[str, int] | None:
+    """{image: the number of its zoom}, by a model of pycolmap's with a lens for each image; None if
+    all have the same. Images without a place have the zoom of most.
+    """
+    lengths = {i.name: np.log(model.cameras[i.camera_id].focal_length) for i in _placed(model)}
+    ordered = sorted(lengths, key=lengths.__getitem__)
+    steps = np.diff([lengths[name] for name in ordered]) > ZOOMED
+    groups = np.split(np.array(ordered), np.flatnonzero(steps) + 1)
+    large = [group for group in groups if len(group) >= LEAST_ZOOMED] or groups[:1]
+    centres = np.array([np.mean([lengths[name] for name in group]) for group in large])
+    numbers, lone = {}, len(large)
+    for name in ordered:
+        apart = np.abs(centres - lengths[name])
+        numbers[name] = int(apart.argmin()) if apart.min() < LONE_ZOOMED else lone
+        lone += apart.min() >= LONE_ZOOMED
+    often = Counter(numbers.values()).most_common()
+    return {n: numbers.get(n, often[0][0]) for n in names} if len(often) > 1 else None
+
+
+def _zoom_line(model):
+    """Half a sentence on the focal lengths of pycolmap's model."""
+    (usual, _), *rest = Counter(image.camera_id for image in _placed(model)).most_common()
+    times = {lens: model.cameras[lens].focal_length for lens, _ in rest}
+    of_usual = model.cameras[usual].focal_length
+    return ", ".join(
+        f"{count} with {times[lens] / of_usual:.2f} times the focal length of most"
+        for lens, count in rest
+    )
+
+
+def _focal_ratio(model, image):
+    """By how much an image's own focal length is larger than its lens's, by the points of
+    pycolmap's model in it: its pose and the ratio are adjusted to them. 1 if they are few.
+    """
+    points = [point for point in image.points2D if point.has_point3D()]
+    if len(points) < FEW_MATCHES:
+        return 1.0
+    world = np.array([model.points3D[point.point3D_id].xyz for point in points])
+    seen = model.cameras[image.camera_id].cam_from_img(np.array([point.xy for point in points]))
+    matrix = image.cam_from_world().matrix()
+    rotation, shift, ratio = matrix[:, :3], matrix[:, 3], 1.0
+    for _ in range(ADJUSTED):
+        places = world @ rotation.T + shift
+        x, y, z = places.T
+        off = seen - ratio * places[:, :2] / z[:, None]
+        one, zero = ratio / z, np.zeros_like(z)
+        by_place = np.stack(
+            [np.stack([one, zero, -one * x / z], -1), np.stack([zero, one, -one * y / z], -1)], 1
+        )  # (N, 2, 3)
+        by_turn = np.cross(places[:, None], by_place)
+        by_ratio = (places[:, :2] / z[:, None])[..., None]
+        rows = np.concatenate([by_turn, by_place, by_ratio], -1)
+        errors = np.linalg.norm(off, axis=1)
+        weights = 1 / np.sqrt(1 + (errors / (2 * np.median(errors))) ** 2)
+        step = np.linalg.lstsq(
+            (rows * weights[:, None, None]).reshape(-1, 7),
+            (off * weights[:, None]).ravel(),
+            rcond=None,
+        )[0]
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        rotation, shift, ratio = turn @ rotation, turn @ shift + step[3:6], ratio + step[6]
+    return float(ratio)
 
 
 def contradictions(database: Path, model: Any) -> list[tuple[str, str]]:

@@ -30,12 +30,23 @@ from pp_cl.files import (
     write_json,
     write_png,
 )
-from pp_cl.scene import LensDistortion, frame_keys, named_mask, read_edits, read_json, shrink
+from pp_cl.scene import (
+    HELD_OUT,
+    LensDistortion,
+    frame_keys,
+    named_mask,
+    read_edits,
+    read_json,
+    shrink,
+)
 from pp_studio.capture import STAGES, box, features, frames, masks, poses
 from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
 SCENE_FILE = "transforms.json"
+# Photographs of bursts, closer to each other than this share of their distance from the object, are
+# held out together.
+TWINS = 0.02
 FOLLOWED = 4  # images that must show a point, since wrong matches seldom occur in as many
 SHOWN_WIDTH = 1000  # pixels of the images of points and cameras
 # decimals in the scene's file: the last digits depend on how COLMAP's threads share a sum
@@ -295,7 +306,8 @@ class Capture:
         unplaced = [f"{name} {why}" for name, why in facts["unplaced"].items()]
         line = (
             f"{facts['placed']} of {len(taken)} images, {facts['points']} points, reprojection"
-            f" error {facts['error']:.2f} pixels{_but(unplaced, 'without a place')}"
+            f" error {facts['error']:.2f} pixels{facts['zoomed'] and '; ' + facts['zoomed']}"
+            f"{_but(unplaced, 'without a place')}"
             f"{_but(facts['weak'], 'may be a little off, by few matches')}"
         )
         return {"line": line, **facts}
@@ -384,8 +396,13 @@ class Capture:
         with atomic_path(self.scene / "points.ply") as unfinished:
             model.export_PLY(unfinished)
         stated = {"camera_model": "OPENCV", "ply_file_path": "points.ply"}
-        write_json(self.scene / SCENE_FILE, stated | {"aabb": _rounded(corners), "frames": places})
-        return {"line": f"wrote {self.scene / SCENE_FILE} with {len(image_files)} photographs"}
+        of_splits, twins = _splits(image_files)
+        stated |= {"aabb": _rounded(corners), **of_splits, "frames": places}
+        write_json(self.scene / SCENE_FILE, stated)
+        line = f"wrote {self.scene / SCENE_FILE} with {len(image_files)} photographs"
+        if twins:
+            line += f", {twins} of them from the place of another, so held out with it or not"
+        return {"line": line}
 
     def _show(self, stage, model, corners):
         """Write a stage's image, which shows a model's points and cameras, and a box (2, 3)."""
@@ -405,6 +422,28 @@ class Capture:
             return model, edited
         grown = self._found("masks").get("box") if self._is_done("masks") else None
         return model, np.array(grown or facts["box"])
+
+
+def _splits(image_files):
+    """({the lists of the scene's splits}, how many photographs are from the place of another, as in
+    bursts): every eighth place is for test. No lists without such photographs, as readers do so.
+    """
+    eyes = np.array([image_file.camera.eye for image_file in image_files])
+    reach = TWINS * np.median(np.linalg.norm(eyes, axis=1))
+    places: list[list[int]] = []
+    for i, eye in enumerate(eyes):
+        away = [np.linalg.norm(eyes[place[0]] - eye) for place in places]
+        if away and min(away) < reach:
+            places[int(np.argmin(away))].append(i)
+        else:
+            places.append([i])
+    if len(places) == len(eyes):
+        return {}, 0
+    held = {i for place in places[::HELD_OUT] for i in place}
+    lists: dict[str, list[str]] = {"train_filenames": [], "test_filenames": []}
+    for i, image_file in enumerate(image_files):
+        lists["test_filenames" if i in held else "train_filenames"].append(image_file.name)
+    return lists, len(eyes) - len(places)
 
 
 def _is_uniform(taken):

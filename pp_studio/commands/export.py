@@ -66,8 +66,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared.add_device(parser)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Write the run, and print what was written."""
+def run(options: argparse.Namespace, *, kept: bool = False) -> None:
+    """Write the run, and print what was written. kept: a splat is of the Gaussians that are kept,
+    however few steps they were fitted in.
+    """
     from pp_cl import find_run, load, open_device
     from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
@@ -106,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
         name,
         path,
         min_weight=options.min_weight or 0.0,
-        quality=options.quality or QUICK,
+        quality=options.quality or (None if kept else QUICK),
         box=options.box,
         axes=options.axes,
         others=map(loaded, others),

@@ -1,8 +1,10 @@
 """`pp-cl make`: turns photographs, a video or a scene into a folder to send to others."""
 
 import argparse
+import hashlib
 import importlib
 import itertools
+import os
 import shlex
 import time
 import warnings
@@ -40,6 +42,7 @@ LEAST_MORE = 0.1  # minutes that must be left for a finished training to go on
 LATE = 0.8  # the time per step is measured after this share of a training
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
 MOST_GAUSSIANS = 180_000  # of the splat: a page of them has 9.7 MB
+MARKED = 2**16  # bytes of a checkpoint's end
 OF_SPLAT = 0.6  # share of the minutes left after the evaluation
 # of a training on photographs: poses are not exact, and surfaces would have pits
 SMOOTH = ["--set", "train.depth_weight=0.001"]
@@ -83,6 +86,7 @@ def run(options: argparse.Namespace) -> None:
         MODEL,
         SPLAT,
         STATE,
+        STILL,
         VIDEOS,
         begin_result,
         is_newer,
@@ -175,18 +179,24 @@ def run(options: argparse.Namespace) -> None:
         show("Trained; the figures follow.", split)
         print(f"wrote {page}: with the model; figures, splat and video follow", flush=True)
         step("eval", str(folder), "--split", split, *device)
+        made = [out / name for name in (SPLAT, video, STILL, MODEL) if (out / name).exists()]
+        is_copied = not all(is_newer(file, folder.checkpoint) for file in made)
+        if is_copied and clock.made_of == _mark(folder.checkpoint):
+            for file in made:  # in a copy of the folder, the checkpoint may be the newest file
+                file.touch()
         if not is_newer(out / SPLAT, folder.checkpoint):
             show("Trained and measured; splat and video follow.", split)
             # export writes these Gaussians to the file
             limits = OF_SPLAT * clock.left, MOST_GAUSSIANS
             fitted_gaussians(load(folder.path, options.device), QUICK, *limits)
             words = ["--format", "splat"]
-            step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
+            step("export", str(folder), "--out", str(out / SPLAT), *words, *device, kept=True)
         if not is_newer(out / video, folder.checkpoint):
             show("Trained and measured; the video follows.", split)
             words = ["--minutes", f"{clock.left:.3g}"]
             step("render", str(folder), "--out", str(out / video), *words, *device)
         show("", split)
+        clock.made_of = _mark(folder.checkpoint)
     print(
         f"wrote {page} in {clock.passed:.1f} minutes; `pp-cl view {pasted(folder)}` shows the exact"
         " model"
@@ -214,6 +224,7 @@ class _Clock:
         self._planned = known.get("planned", self.minutes)
         self._iterations: int | None = known.get("iterations")
         self._until = max(self.minutes, known.get("until", 0.0))
+        self.made_of = known.get("made_of")  # _mark() of the checkpoint of which all was made
         self._began = time.monotonic()
 
     def __enter__(self) -> "_Clock":
@@ -231,7 +242,7 @@ class _Clock:
         self._passed, self._began = self.passed, time.monotonic()
         kept = {"title": self.title, "minutes": self.minutes, "passed": round(self._passed, 2)}
         kept |= {"planned": self._planned, "until": round(self._until, 2)}
-        write_json(self._file, kept | {"iterations": self._iterations})
+        write_json(self._file, kept | {"iterations": self._iterations, "made_of": self.made_of})
 
     @property
     def passed(self) -> float:
@@ -321,6 +332,15 @@ def _wrote_hull(out, scene, title, options, masks):
     if hull:
         write_model(out, *hull, title)
     return hull is not None
+
+
+def _mark(checkpoint):
+    """Text that tells a checkpoint from others: a digest of its file's end, which has the checksums
+    of all its arrays.
+    """
+    with checkpoint.open("rb") as file:
+        file.seek(-min(MARKED, file.seek(0, os.SEEK_END)), os.SEEK_END)
+        return hashlib.sha256(file.read()).hexdigest()
 
 
 def _written(scene):

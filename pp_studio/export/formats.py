@@ -55,7 +55,7 @@ def export_run(
     path: Path | str,
     *,
     min_weight: float = 0.0,
-    quality: str = QUICK,
+    quality: str | None = QUICK,
     box: Sequence[float] | None = None,
     axes: str | None = None,
     others: Iterable[Run] = (),

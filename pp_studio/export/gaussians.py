@@ -14,7 +14,6 @@ import math
 import time
 import warnings
 import zipfile
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -188,32 +187,34 @@ def fitted_gaussians(
     run: Run, quality: str | None = None, minutes: float = math.inf, most: float = math.inf
 ) -> Gaussians:
     """The run's Gaussians, fitted once per checkpoint and kept as FILE in the run's folder for
-    later calls. quality: one of QUALITIES; None: any that is kept, else QUICK. minutes,
-    most: as in fit_gaussians(). Raises UserError as check_drawable does.
+    later calls. quality: one of QUALITIES; None: any that is kept, limited or not, else QUICK.
+    minutes, most: as in fit_gaussians(). Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    if gaussians := kept_gaussians(run, [quality] if quality else QUALITIES):
+    if gaussians := kept_gaussians(run, quality):
         return gaussians
+    limited = min(minutes, most) < math.inf
     table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes, most))
     specular = _fit_specular(run, _fitted(run, table, {}))
     stored = {LAYER + name: array for name, array in specular.items()}
     try:
         with atomic_file(run.folder.path / FILE) as file:
-            np.savez(file, key=np.array(_key(run, quality or QUICK)), gaussians=table, **stored)
+            key = _keys(run)[quality or QUICK, limited]
+            np.savez(file, key=np.array(key), gaussians=table, **stored)
     except UserError as error:
         warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
     return _fitted(run, table, specular)
 
 
-def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians | None:
-    """The Gaussians that fitted_gaussians() kept for the run's checkpoint in one of these
-    qualities; None if there are none or the file is damaged.
+def kept_gaussians(run: Run, quality: str | None = None) -> Gaussians | None:
+    """The Gaussians that fitted_gaussians() kept for the run's checkpoint in a quality, without
+    limits; quality None: in any, limited or not. None if there are none or the file is damaged.
     """
+    keys = _keys(run)
+    allowed = [keys[quality, False]] if quality else keys.values()
     try:
         with np.load(run.folder.path / FILE) as stored:
-            key = str(stored["key"])
-            is_kept = any(key == _key(run, quality) for quality in qualities)
-            table = stored["gaussians"] if is_kept else np.empty(0)
+            table = stored["gaussians"] if str(stored["key"]) in allowed else np.empty(0)
             names = [name for name in Specular.shapes() if LAYER + name in stored]
             specular = {name: stored[LAYER + name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
@@ -261,12 +262,16 @@ def first_gaussians(run: Run) -> Gaussians:
     return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 
-def _key(run, quality):
-    """What the Gaussians depend on, as text."""
+def _keys(run):
+    """{(quality, whether minutes or a number limited the fit): what it depends on, as text}."""
     cloud = run.model.cloud
     arrays = [array.get().tobytes() for array in (cloud.ids, cloud.offset, cloud.opacity)]
     digest = hashlib.sha256(b"".join(arrays)).hexdigest()
-    return json.dumps([digest, run.header["step"], *QUALITIES[quality]])
+    return {
+        (quality, limited): json.dumps([digest, run.header["step"], *fit, limited])
+        for quality, fit in QUALITIES.items()
+        for limited in (False, True)
+    }
 
 
 def _table(run, cloud):

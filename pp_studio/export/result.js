@@ -13,12 +13,23 @@ addEventListener("message", ({ source, data }) => {
   if (String(data).startsWith("#")) history.replaceState(null, "", data);
 });
 window.ppclVersion = (newest) => {
+  if (!version) return;  // nothing is newer
   // not for an older one, which a folder that is being copied may have for a while; the last is ""
   if ((!newest || newest > version) && !isHeld) location.reload();
 };
-if (version) setInterval(() => {
+const ask = (lacks = () => {}) => {
   const script = document.createElement("script");
   script.src = `version.js?${Date.now()}`;
-  script.onload = script.onerror = () => script.remove();
+  script.onload = () => script.remove();
+  script.onerror = () => { script.remove(); lacks(); };
   document.head.append(script);
-}, AGAIN);
+};
+ask(() => {  // this page came without its folder
+  const told = document.createElement("p");
+  told.className = "later";
+  told.textContent = "What this page shows is not beside it: send the whole folder, or model.html "
+    + "alone, which needs no other file.";
+  document.querySelector("h1").after(told);
+  if (model) model.remove();
+});
+if (version) setInterval(ask, AGAIN);

@@ -28,7 +28,7 @@ Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # the up directions of a .ply 
 
 
 def splats(
-    run: Run, turn: np.ndarray, quality: str = QUICK, box: np.ndarray | None = None
+    run: Run, turn: np.ndarray, quality: str | None = QUICK, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality, turned by (3, 3);
     all, or those in a box (2, 3) of the scene. The origin is 0 unless float32 is too coarse there.

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image, ImageCms
-from support.profile import display_p3, in_srgb
+from support.profile import SRGB, display_p3, in_srgb
 from support.refused import refusing
 
 from pp_cl.errors import Unusable, UserError
@@ -19,6 +19,7 @@ from pp_cl.files.image import (
     to_8bit,
     write_png,
 )
+from pp_cl.files.srgb import linear_to_srgb
 
 
 @pytest.fixture
@@ -111,6 +112,9 @@ def test_colours_of_other_spaces_become_srgb(tmp_path):
     assert np.abs(rgb - in_srgb((200, 90, 60))).max() <= 1
     image.save(tmp_path / "srgb.jpg", icc_profile=own, quality=95, subsampling=0)
     assert np.abs(read_rgba(tmp_path / "srgb.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 2
+    image.save(tmp_path / "linear.png", icc_profile=display_p3(b"Linear sRGB", SRGB, 1.0))
+    light = 255 * linear_to_srgb(np.array([200, 90, 60]) / 255)  # its name is not what counts
+    assert np.abs(read_rgba(tmp_path / "linear.png")[..., :3] - light).max() <= 1
     image.convert("CMYK").save(tmp_path / "inks.jpg", quality=95)
     assert np.abs(read_rgba(tmp_path / "inks.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 4
     half = np.tile(np.uint8([100, 45, 30, 128]), (30, 40, 1))

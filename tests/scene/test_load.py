@@ -130,6 +130,11 @@ EXPORTED = {
     "cameras.csv": "perhaps RealityCapture's",
     "cams/00000000_cam.txt": "BlendedMVS's",
     "keyframes/corrected_cameras/1.json": "Polycam's",
+    "cameras.sfm": "Meshroom's; write COLMAP's files with `aliceVision_exportColmap`",
+    "sfm_data.json": "OpenMVG's; write COLMAP's files with `openMVG_main_openMVG2Colmap`",
+    "reconstruction.json": "perhaps OpenSfM's",
+    "scene.nvm": "VisualSFM's",
+    "bundle.rd.out": "Bundler's",
 }
 
 

@@ -10,17 +10,17 @@ SRGB = np.array([[0.4361, 0.3851, 0.1431], [0.2225, 0.7169, 0.0606], [0.0139, 0.
 GAMMA = 2.2
 
 
-def display_p3():
-    """The bytes of the profile, version 2."""
+def display_p3(name=b"Display P3", primaries=P3, gamma=GAMMA):
+    """The bytes of the profile, version 2, or of another one."""
 
     def xyz(values):
         return b"XYZ \0\0\0\0" + b"".join(struct.pack(">i", round(v * 65536)) for v in values)
 
-    curve = b"curv\0\0\0\0" + struct.pack(">IHxx", 1, round(GAMMA * 256))
-    name = b"Display P3\0"
+    curve = b"curv\0\0\0\0" + struct.pack(">IHxx", 1, round(gamma * 256))
+    name += b"\0"
     described = b"desc\0\0\0\0" + struct.pack(">I", len(name)) + name + bytes(78)
     tags = {b"desc": described, b"wtpt": xyz((0.9642, 1, 0.8249))}
-    tags |= {b"%cXYZ" % c: xyz(P3[:, i]) for i, c in enumerate(b"rgb")}
+    tags |= {b"%cXYZ" % c: xyz(primaries[:, i]) for i, c in enumerate(b"rgb")}
     tags |= {b"%cTRC" % c: curve for c in b"rgb"}
     table, data = b"", b""
     for key, content in tags.items():

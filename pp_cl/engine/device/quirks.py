@@ -22,8 +22,9 @@ SPILLING_ON_INTEL = frozenset(
     )
 )
 
-# bytes of host memory that a driver's compiler uses until all kernels of a training are built, by
-# platform; for platforms that are not listed, the largest is assumed
+# Platforms of drivers for CPUs. Bytes of host memory that their compilers use until all kernels of
+# a training are built; for other platforms, the largest is assumed. They take clang's prefetches,
+# with which rusticl's software renderer ends the process (Mesa 22.3).
 COMPILER_BYTES = {"Portable Computing Language": 80 * 2**20, "Intel(R) OpenCL": 620 * 2**20}
 
 
@@ -34,6 +35,8 @@ def compiler_bytes(info: dict[str, Any]) -> int:
 
 def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
     """Build options of cl/<name>.cl specific to the device's vendor. info: from describe()."""
+    if info["type"] == "CPU" and info["platform"] in COMPILER_BYTES:
+        return ("-DREADS_AHEAD",)
     intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
     large = intel_gpu and name in SPILLING_ON_INTEL
     return ("-cl-intel-256-GRF-per-thread",) if large else ()

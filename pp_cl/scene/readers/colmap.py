@@ -27,6 +27,7 @@ from pp_cl.scene.found import (
     folder_named,
     folder_of,
     holds_images,
+    listed_in,
     nested,
     usable,
 )
@@ -49,6 +50,7 @@ STATES = "world-to-camera", "opencv"
 # model into the folder itself. If none has a model, deeper folders are searched.
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")
 IMAGES = "images"
+LISTS = {"test": "test.txt", "train": "train.txt"}  # of image names, beside a model
 
 # number of parameters of each camera model of COLMAP, in the order of their ids
 MODELS = {
@@ -109,8 +111,9 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: every eighth in the order of names is for test. Cameras are scaled to
-    images that were reduced afterwards. Raises UserError naming the file and the image.
+    """The images of a split: those of LISTS beside the model, as 3DGS has them; without lists,
+    every eighth in the order of names is for test. Cameras are scaled to images that were reduced
+    afterwards. Raises UserError naming the file and the image.
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
@@ -129,9 +132,30 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     images.sort(key=lambda image: image.name)
     near = _images_of(folder, model) or folder_of(folder, [image.name for image in images])
     near = near or folder / IMAGES
-    chosen = hold_out(images, split, [near / image.name for image in images])
+    chosen = _listed(model, images, split)
+    if chosen is None:
+        chosen = hold_out(images, split, [near / image.name for image in images])
     read = partial(_image_file, folder, near.relative_to(folder).as_posix(), model, lenses)
     return list(usable(progress(chosen), read, lambda image: image.name, left_out))
+
+
+def _listed(model, images, split):
+    """The images of a split by LISTS; None without them. What only one list leaves is the other's,
+    and no image is in both: training gets none that are for test.
+    """
+    names = [image.name for image in images]
+    of_split = {
+        name: listed_in(model / file, names)
+        for name, file in LISTS.items()
+        if (model / file).is_file()
+    }
+    if not of_split:
+        return None
+    test = of_split["test"] if "test" in of_split else {*names} - of_split["train"]
+    chosen = test if split == "test" else of_split.get("train", {*names}) - test
+    told = " and ".join(LISTS[name] for name in of_split)
+    warnings.warn(f"{model}: splits are as {told} lists them", stacklevel=1)
+    return [image for image in images if image.name in chosen]
 
 
 def model_folder(folder: Path) -> Path | None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -209,7 +210,11 @@ def _read_array(opened, most):
 
 
 def as_number(word: str) -> float:
-    """The number that a word of text means; it may have a decimal comma. Raises ValueError."""
+    """The number that a word of text means; it may have a decimal comma. NaN for what Windows
+    writes for NaN and infinity, such as -nan(ind) and 1.#INF. Raises ValueError.
+    """
+    if re.fullmatch(r"[+-]?(nan\(\w*\)|1\.#\w+)", word, re.IGNORECASE):
+        return math.nan
     return float(word.replace(",", ".") if word.count(",") == 1 and "." not in word else word)
 
 

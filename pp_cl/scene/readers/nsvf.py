@@ -7,7 +7,7 @@ from pathlib import Path
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.found import LeftOut, folder_images, image_folder, usable
+from pp_cl.scene.found import LeftOut, find_file, folder_images, image_folder, usable
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import fail_at, fitted, read_numbers
 from pp_cl.scene.readers.frame import rigid
@@ -46,7 +46,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         depth_range = values[0], values[1]
 
     def read(name):
-        pose_file = folder / POSES / f"{Path(name).stem}.txt"
+        pose_file = find_file(folder / POSES, f"{Path(name).stem}.txt")
         if not pose_file.exists():
             raise Unusable(f"{pose_file}: no such file; copy it there", "no pose")
         pose = rigid(read_numbers(pose_file), fail_at(pose_file))

@@ -168,7 +168,6 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
     ("platform", "kind", "large"),
     [
         ("Intel(R) OpenCL Graphics", "GPU", True),
-        ("Intel(R) OpenCL", "CPU", False),
         ("Apple", "GPU", False),  # drives Intel's GPUs too, and refuses unknown options
         ("NVIDIA CUDA", "GPU", False),
     ],
@@ -178,6 +177,9 @@ def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, la
     expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
     assert quirks.vendor_options(info, "layers/conv_backward") == expected
     assert quirks.vendor_options(info, "raster/shade") == ()
+    for driver, expected in (("Intel(R) OpenCL", ("-DREADS_AHEAD",)), ("rusticl", ())):
+        info = {"platform": driver, "type": "CPU"}
+        assert quirks.vendor_options(info, "layers/conv_backward") == expected
     files = quirks.SPILLING_ON_INTEL
     assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
 

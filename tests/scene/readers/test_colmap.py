@@ -239,6 +239,41 @@ def test_of_several_models_the_largest_is_read(written):
     assert [view.name for view in scene_frames(folder)][:2] == ["000001.png", "000002.png"]
 
 
+@pytest.mark.parametrize("ending", ["", ".png"])
+def test_lists_beside_a_model_are_its_splits(text, ending):
+    """As 3DGS reads test.txt. What only a list of training leaves is for test."""
+    names = sorted(file.name for file in (text / "images").iterdir())
+    model = text / "sparse/0"
+
+    def split(name):
+        with pytest.warns(UserWarning, match=r"splits are as t\w+\.txt( and train\.txt)? lists"):
+            return [Path(image.name).name for image in read_split(text, name, [])]
+
+    def write(name, of):
+        (model / name).write_text("\n".join(Path(n).stem + ending for n in of) + "\n\n")
+
+    write("test.txt", names[-3:])
+    assert (split("test"), split("train")) == (names[-3:], names[:-3])
+    write("train.txt", names[2:])
+    assert (split("test"), split("train")) == (names[-3:], names[2:-3])
+    (model / "test.txt").unlink()
+    assert (split("test"), split("train")) == (names[:2], names[2:])
+    write("train.txt", ["other"])
+    refused(text, model / "train.txt", "names no image", splits=("train", "test"))
+
+
+@pytest.mark.parametrize("word", ["-nan(ind)", "1.#QNAN", "-1.#INF", "nan"])
+def test_a_number_that_windows_writes_loses_its_views_alone(text, word):
+    file = text / "sparse/0/images.txt"
+    lines = file.read_text().splitlines(keepends=True)
+    at = next(i for i, line in enumerate(lines) if line.rstrip().endswith("000003.png"))
+    words = lines[at].split(" ")
+    words[5] = word
+    lines[at] = " ".join(words)
+    file.write_text("".join(lines))
+    left_out(text, "unit quaternion", split="train")
+
+
 def test_models_of_later_versions_are_named(binary):
     """SIMPLE_DIVISION, number 12, has as many parameters as PINHOLE. Only the view that has it is
     lost.

@@ -1,3 +1,5 @@
+import unicodedata
+
 import pytest
 from support.same_scene import same, views
 from support.transforms_scenes import refused
@@ -45,6 +47,14 @@ def test_intrinsics(scene, text, expected):
     (scene / "intrinsics.txt").write_text(text)
     camera = read_split(scene, "train", [])[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
+
+
+def test_poses_in_another_form_of_the_names(scene):
+    """An accent may be part of its letter, or a character of its own."""
+    for folder, form in (("rgb", "NFC"), ("pose", "NFD")):
+        for file in (scene / folder).iterdir():
+            file.rename(file.with_stem(unicodedata.normalize(form, f"{file.stem}_é")))
+    assert len(read_split(scene, "train", left_out := [])) == 6 and not left_out
 
 
 def test_near_and_far(scene):

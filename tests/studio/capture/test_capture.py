@@ -16,10 +16,11 @@ from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_mask, read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.listing import scene_format, scene_frames
 from pp_cl.scene.load import load_scene
-from pp_studio.capture import poses
+from pp_studio.capture import poses, stages
 from pp_studio.capture.features import quiet, verification
 from pp_studio.capture.frames import take_images, undistorted_mask
 from pp_studio.video import write_video
@@ -439,3 +440,20 @@ def test_a_wall_places_no_cameras(dev, tmp_path):
     scene = tmp_path / "scene"
     refused(turned(dev, tmp_path, range(0, 72, 8))[0], scene, named=scene)
     assert found(scene, "matches")["turns"] and (scene / "capture" / "turns").exists()
+
+
+def test_photographs_of_bursts_are_held_out_together(tmp_path):
+    """Two photographs from each of eighteen places; one place alone is left to the readers."""
+    cameras = [
+        Camera.look_at(
+            (4 * np.cos(turn), 4 * np.sin(turn), shake), (0, 0, 0), fx=50, width=9, height=9
+        )
+        for turn in np.arange(18) / 3
+        for shake in (1, 1.05)
+    ]
+    listed = [ImageFile(f"images/{i:03d}.jpg", camera) for i, camera in enumerate(cameras)]
+    lists, twins = stages._splits(listed)
+    held = [f"images/{i:03d}.jpg" for i in (0, 1, 16, 17, 32, 33)]
+    assert twins == 18 and lists["test_filenames"] == held
+    assert sorted(lists["train_filenames"] + held) == [image.name for image in listed]
+    assert stages._splits(listed[::2]) == ({}, 0)

@@ -136,6 +136,38 @@ def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
     assert ids == list(range(1, 10))
 
 
+def test_photographs_are_known_by_their_content(shots, folder, tmp_path):
+    """Cameras name HEIF .HIF; what looks like a photograph and is not read is named."""
+    heif = pytest.importorskip("pillow_heif")
+    for i, image in enumerate(shots):
+        heif.from_pillow(Image.fromarray(image)).save(folder / "made.heic")
+        (folder / "made.heic").rename(folder / f"IMG_{i:02d}.HIF")
+    (folder / "IMG_11.HIF").rename(folder / "without ending")
+    (folder / "later.jxl").write_bytes(b"\xff\x0a")
+    (folder / "notes.txt").write_text("no photograph")
+    taken = take_images(folder, tmp_path / "images")
+    assert {photo["source"] for photo in taken["images"]} == {
+        "without ending",
+        *(f"IMG_{i:02d}.HIF" for i in range(11)),
+    }
+    [unread] = taken["left_out"]
+    assert unread["source"] == "later.jxl" and "kind that is not read (.jxl)" in unread["reason"]
+    for file in folder.iterdir():
+        file.rename(file.with_suffix(".jxl"))
+    with pytest.raises(UserError, match=r"no photographs in it .*\.jxl are not read"):
+        take_images(folder, tmp_path / "others")
+
+
+@pytest.mark.parametrize("zoom, lenses", [(1.5, 2), (1, 1), (0, 1)])
+def test_a_digital_zoom_is_another_lens(shots, folder, tmp_path, zoom, lenses):
+    for i, image in enumerate(shots):
+        exif = Image.Exif()
+        exif.get_ifd(frames.EXIF).update({FOCAL: 4.3, frames.ZOOM: zoom if i % 3 else 1})
+        Image.fromarray(image).save(folder / f"{i:02d}.jpg", exif=exif, quality=95)
+    taken = take_images(folder, tmp_path / "images")["images"]
+    assert len({photo["lens"] for photo in taken}) == lenses
+
+
 @pytest.mark.unix
 def test_names_that_colmap_can_list(shots, tmp_path):
     """Names are ASCII, without spaces or a leading #, and unique if case is ignored."""
@@ -174,6 +206,14 @@ def test_a_video_that_states_no_length(video, tmp_path):
     live = remade(video, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
     whole, other = (take_images(file, tmp_path / file.stem)["images"] for file in (video, live))
     assert [shot["name"] for shot in other] == [shot["name"] for shot in whole] and len(other) > 40
+
+
+def test_a_video_that_was_cut_off(video, tmp_path):
+    """Its head tells of frames that are missing."""
+    cut = tmp_path / "cut.webm"
+    cut.write_bytes(video.read_bytes()[: video.stat().st_size * 6 // 10])
+    with pytest.warns(UserWarning, match=r"only \d+ of its 48 frames are there"):
+        take_images(cut, tmp_path / "cut")
 
 
 def test_a_video_that_is_shown_turned(video, tmp_path, caplog):

@@ -26,23 +26,26 @@ def ring(steps=STEPS):
     return cameras
 
 
-def matched(folder, rng, k1=0.0, steps=STEPS):
-    """(database, images, facts) of photographs with a lens of distortion k1, and their matches."""
+def matched(folder, rng, k1=0.0, steps=STEPS, zoom=1.0, count=COUNT):
+    """(database, images, facts) of photographs with a lens of distortion k1, and their matches.
+    zoom: of every third.
+    """
     (images := folder / "images").mkdir()
     database, names = folder / "database.db", [f"{i:03d}.png" for i in range(steps)]
     for name in names:
         Image.new("L", (SIZE, SIZE)).save(images / name)
-    points = rng.normal(size=(COUNT, 3))
+    points = rng.normal(size=(count, 3))
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     with quiet(folder), colmap.Database.open(database) as db:
         options = colmap.ImageReaderOptions(camera_model=LENS)
         colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
         ids, shown = [db.read_image_with_name(name).image_id for name in names], []
-        for number, camera in zip(ids, ring(steps), strict=True):
+        for i, (number, camera) in enumerate(zip(ids, ring(steps), strict=True)):
             shown.append(np.flatnonzero(points @ camera.eye > 0.4 * DISTANCE))
             plane = (np.stack(camera.project(points[shown[-1]])[:2], 1) - SIZE / 2) / FOCAL
             plane *= 1 + k1 * (plane**2).sum(1, keepdims=True)
-            pixels = FOCAL * plane + SIZE / 2 + rng.normal(0, NOISE, plane.shape)
+            focal = FOCAL * (zoom if i % 3 == 0 else 1)
+            pixels = focal * plane + SIZE / 2 + rng.normal(0, NOISE, plane.shape)
             db.write_keypoints(number, pixels.astype(np.float32))
         for i in range(steps):
             for j in range(i + 1, steps):
@@ -81,3 +84,19 @@ def test_a_lens_is_straight_unless_it_distorts(tmp_path, rng, k1):
     assert distortion == pytest.approx(k1, abs=-0.2 * k1)
     off = align([image_file.camera for image_file in placed], ring())
     assert off.position < 0.02 and off.degrees < 0.5
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.5])
+def test_a_zoom_that_no_tag_states(tmp_path, rng, zoom):
+    database, images, taken = matched(tmp_path, rng, zoom=zoom, count=4 * COUNT)
+    facts = poses.place(database, images, tmp_path / "model", taken, False)
+    assert facts["placed"] == STEPS
+    placed = [
+        image_file.camera
+        for image_file in poses.image_files(colmap.Reconstruction(tmp_path / "model"))
+    ]
+    off = align(placed, ring())
+    assert off.position < 0.01 * DISTANCE and off.degrees < 0.5
+    focal = np.array([camera.fx for camera in placed])
+    assert np.allclose(focal[::3] / focal[1::3], zoom, rtol=0.02)
+    assert ("12 with 1." in facts["zoomed"]) == (zoom > 1)

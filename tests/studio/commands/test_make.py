@@ -60,6 +60,10 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     assert made == [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
     assert (folder / "index.html").exists() and (folder / "thumbnail.png").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
+    (folder / "run/checkpoint.npz").touch()  # as in a copy of the folder
+    assert main(["make", scene, "--out", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert "== pp-cl export" not in printed and "== pp-cl render" not in printed
 
 
 def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypatch):
