@@ -1,4 +1,3 @@
-from .bench.frontier import fastest as fastest
 from .drivers import open_device as open_device
 from .drivers import separate_devices as separate_devices
 from .engine.camera import Camera as Camera

@@ -1,13 +1,8 @@
-"""`pp-cl bench RUN`: renders a finished run at settings that trade time for error, and keeps the
-fastest of those that are hardly worse than the default in the run's folder.
-"""
+"""`pp-cl bench RUN`: renders a finished run at settings that trade time for error."""
 
-import hashlib
 import itertools
-import json
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -15,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl import __version__
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.engine.network.unet import UNet
@@ -23,8 +17,6 @@ from pp_cl.engine.render import is_supersampled
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View, evenly
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import check_ours, write_json
-from pp_cl.files.untrusted import opened_zip, read_json_text, strict_json
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.progress import Progress, track
 from pp_cl.run import Run
@@ -34,11 +26,8 @@ SHARES = 1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1  # shares of the points to keep
 # At most MOST_VIEWS test views are rendered; if frames are slow, as many as a round of ROUND
 # seconds allows, but at least LEAST_VIEWS. This many are timed repeatedly, for SECONDS in all.
 MOST_VIEWS, LEAST_VIEWS, ROUND, SECONDS = 16, 4, 40.0, 40.0
-MOST_LOSS = 0.1  # dB that the fastest setting may lose against the default
-LEAST_GAIN = 1.1  # times as fast as the default: two runs may differ by less
 # dB that single changes may lose in sum if they are to be tried together
 TOGETHER = 0.08, 0.3, 1.0
-MOST_KEPT = 2**20  # largest size of the file in bytes; a row takes some 600
 
 
 @dataclass(frozen=True)
@@ -165,24 +154,18 @@ def visibility(run: Run) -> np.ndarray:
 
 def measured(run: Run, metrics: tuple[str, ...] = ("psnr",)) -> dict[str, Any]:
     """Measure what `pp-cl bench RUN` shows: {"run", "device", "platform", "views": how many,
-    "rows"}, kept in the run's folder for fastest(). A row: {"bench": "run", "knob": the field of
+    "rows"}. A row: {"bench": "run", "knob": the field of
     Setting that differs from the default, "together" for several, "default" for none; "setting":
     all fields; "words"; "ms": median of a frame; "ms_range"; "max_err", "mean_err": errors of
     colours in [0, 1] against the exact rendering; the metrics against the photographs, means over
-    the views; "is_default"; "is_frontier": no row with as high a PSNR, to 0.01 dB, is faster;
-    "is_fast": fastest() takes this row}. metrics: must include psnr. Raises UserError as Renderings
+    the views; "is_default"; "is_frontier": no row with as high a PSNR, to 0.01 dB, is faster}.
+    metrics: must include psnr. Raises UserError as Renderings
     and Run.scene() do.
     """
     renderings, dev = Renderings(run), run.dev
-    check_ours([run.folder.frontier])
     rows = Measurement(renderings, run.scene("test").splits["test"], metrics).rows()
     about = {"run": str(run.folder), "device": dev.name, "platform": dev.info["platform"]}
-    result = about | rows
-    try:
-        write_json(run.folder.frontier, {"key": _key(renderings)} | result)
-    except UserError as error:
-        warnings.warn(f"{error}; --fast measures it again", stacklevel=2)
-    return result
+    return about | rows
 
 
 class Measurement:
@@ -303,11 +286,9 @@ class Measurement:
                     "is_default": not changed,
                 }
             )
-        fast = fastest_row(rows)
         for row in rows:
             as_good = [r for r in rows if round(r["psnr"], 2) >= round(row["psnr"], 2)]
             row["is_frontier"] = row is min(as_good, key=lambda r: r["ms"])
-            row["is_fast"] = row is fast
         return rows
 
 
@@ -323,88 +304,6 @@ def release(run: Run) -> None:
         member.renderer.release()
 
 
-def fastest_row(rows: list[dict]) -> dict:
-    """The row that is fastest among those that lose at most MOST_LOSS dB against the default; the
-    default's row if none is LEAST_GAIN times as fast, by medians and by shortest times, which other
-    work on the machine hardly changes. More samples and a smaller early_stop do more work: if they
-    are faster, it is chance.
-    """
-    default = next(row for row in rows if row["is_default"])
-    own = default["setting"]
-
-    def gain(row):
-        return min(default["ms"] / row["ms"], default["ms_range"][0] / row["ms_range"][0])
-
-    able = [
-        row
-        for row in rows
-        if default["psnr"] - row["psnr"] <= MOST_LOSS
-        and row["setting"]["early_stop"] >= own["early_stop"]
-        and row["setting"]["samples"] <= own["samples"]
-    ]
-    fast = max(able, key=gain)
-    return fast if gain(fast) >= LEAST_GAIN else default
-
-
-# ---- the file in the run's folder
-
-
-def fastest(run: Run) -> tuple[Run, str]:
-    """(a finished run with the fastest setting whose PSNR is at most 0.1 dB below the default's, a
-    line that describes it). The setting is measured once for a checkpoint and a device, as `pp-cl
-    bench RUN` does, and kept in the run's folder. Raises UserError as measured() does.
-    """
-    renderings = Renderings(run)
-    setting, line = _kept(renderings) or _chosen(renderings, measured(run))
-    return (run if setting == renderings.default else renderings.varied(setting)), line
-
-
-def _kept(renderings):
-    """_chosen() of the result kept for the run's checkpoint and device; None if there is none, or
-    if the file is not one that a measurement wrote.
-    """
-    try:
-        result = strict_json(read_json_text(renderings.run.folder.frontier, MOST_KEPT))
-        return _chosen(renderings, result) if result["key"] == _key(renderings) else None
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return None
-
-
-def _chosen(renderings, result):
-    """(Setting, the line of fastest()) from the result of measured(). Raises ValueError for values
-    that the run does not have.
-    """
-    (fast,), (default,) = (
-        [row for row in result["rows"] if row[key] is True] for key in ("is_fast", "is_default")
-    )
-    setting = Setting(**fast["setting"])
-    for name, values in renderings.choices.items():
-        if getattr(setting, name) not in values:
-            raise ValueError(f"{name} {getattr(setting, name)!r}")
-    if setting == renderings.default:
-        line = f"no setting is {LEAST_GAIN:g} times as fast as the default within {MOST_LOSS:g} dB"
-    else:
-        line = (
-            f"{renderings.words(setting)}: {default['ms'] / fast['ms']:.2f} times as fast,"
-            f" {fast['psnr']:.2f} dB in place of {default['psnr']:.2f}"
-        )
-    return setting, f"--fast: {line} ({renderings.run.folder.frontier})"
-
-
-def _key(renderings):
-    """A hash of all that a measurement depends on: checksums of the arrays of the checkpoints, the
-    settings with which `pp-cl` renders them, and the device.
-    """
-    sums = []
-    for member in [renderings.run, *renderings.run.others]:
-        with opened_zip(member.folder.checkpoint) as archive:
-            sums.append([[entry.filename, entry.CRC] for entry in archive.infolist()])
-    dev = renderings.run.dev
-    about = [sums, asdict(renderings.default), dev.name, dev.info["platform"]]
-    about += [dev.info["driver"], __version__]
-    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
-
-
 # ---- the printed table
 
 COLUMNS = "{:46} {:>8} {:>8} {:>8} {:>7}  {}".format
@@ -413,7 +312,7 @@ HEAD = COLUMNS("setting", "ms", "largest", "mean", "PSNR", "")
 
 def line(row: dict) -> str:
     """A row of measured() as a line of the printed table."""
-    marks = {"is_default": "the default", "is_frontier": "frontier", "is_fast": "--fast"}
+    marks = {"is_default": "the default", "is_frontier": "frontier"}
     more = [f"LPIPS {row['lpips']:.4f}"] if "lpips" in row else []
     more += [words for name, words in marks.items() if row[name]]
     figures = f"{row['ms']:.1f}", f"{row['max_err']:.1e}", f"{row['mean_err']:.1e}"

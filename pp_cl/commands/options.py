@@ -179,16 +179,6 @@ def add_run_scene(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_fast(parser: argparse.ArgumentParser) -> None:
-    """Add --fast for a command that renders a run."""
-    parser.add_argument(
-        "--fast",
-        action="store_true",
-        help="of a finished run: the fastest setting within 0.1 dB of the default, measured once"
-        " as by `pp-cl bench RUN`",
-    )
-
-
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add --device."""
     parser.add_argument(

@@ -29,9 +29,7 @@ NUMBERS = ("loss", "psnr", "points")  # values of a row that commands read, besi
 
 
 class RunFolder:
-    """The paths in a run's folder `path`: config, checkpoint, log, previews and frontier (of `pp-cl
-    bench RUN`). None need exist.
-    """
+    """The paths in a run's folder `path`: config, checkpoint, log and previews. None need exist."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -39,7 +37,6 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.npz"
         self.log = self.path / "log.jsonl"
         self.previews = self.path / "previews"
-        self.frontier = self.path / "frontier.json"
 
     def __str__(self) -> str:
         return str(self.path)

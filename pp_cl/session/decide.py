@@ -62,6 +62,8 @@ SIDES = {
     40.0: ("full", 1000),
 }
 PACE = 650.0  # speed_of() such a machine
+# In fewer minutes on such a machine, there is no second refinement; points begin closer instead.
+TWICE = 30.0
 RESAMPLED = 1.15  # images are resampled if they are so many times as large; it blurs them a little
 LOOKED, FULL = 0.5, 0.9  # seconds in which the processor's use is measured; share of it
 
@@ -103,7 +105,7 @@ def sized(scene: str, minutes: float, device: str | None) -> tuple[str, float, s
     """(preset, scene.downscale, reason) for a scene in these minutes of training on a device."""
     dev = open_device(device)
     share = free_share() if dev.is_cpu else 1.0
-    worth = minutes * share * (speed_of(dev.device) or PACE) / PACE
+    worth = share * _worth(dev, minutes)
     name, side = next(SIDES[least] for least in sorted(SIDES, reverse=True) if worth >= least)
     cameras = [image_file.camera for image_file in scene_frames(scene)]
     longest = max(max(camera.width, camera.height) for camera in cameras)
@@ -113,6 +115,11 @@ def sized(scene: str, minutes: float, device: str | None) -> tuple[str, float, s
     others = f", of which other programs take {1 - share:.0%}" if share < 1 else ""
     why = f"size: images reduced {downscale:.3g} times, for {minutes:.3g} minutes on this device"
     return name, downscale, f"{why}{others} (--downscale sets another)"
+
+
+def _worth(dev, minutes):
+    """The minutes that a device's minutes are on two cores with AVX-512."""
+    return minutes * (speed_of(dev.device) or PACE) / PACE
 
 
 def free_share() -> float:
@@ -217,7 +224,10 @@ def first_hull(
     cameras = [view.camera for view in views]
     spacing = spacing_pixels(hull.grid, cameras)
     smallest = min(min(camera.width, camera.height) for camera in cameras)
-    possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
+    most, train = len(REFINE_AT) - 1, config.train
+    if train.minutes and _worth(dev, train.minutes / train.members) < TWICE:
+        most = 1
+    possible = [n for n in range(1, most + 1) if smallest >= LEAST_SIDE << n]
     times = sum(spacing > COARSEST * 2 ** (n - 1) for n in possible)
     first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
     if times and first != spacing:

@@ -92,7 +92,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="samples per pixel: 1, 4, 9 or 16",
     )
-    shared.add_fast(parser)
     add(
         "--minutes",
         type=shared.number(0.01, 1e5),
@@ -108,7 +107,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them if one is asked for."""
-    from pp_cl import fastest, load
+    from pp_cl import load
     from pp_cl.files import own
     from pp_cl.scene import read_rate
     from pp_studio.export.render_video import render_frames, render_video
@@ -121,9 +120,6 @@ def run(options: argparse.Namespace) -> None:
     if kind in VIDEOS:
         check_video(kind)
     run = load(options.run_folder, options.device, scene=options.scene)
-    if options.fast:
-        run, line = fastest(run)
-        print(line)
     cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
     sizes = {(camera.width, camera.height) for camera in cameras}
     if kind in VIDEOS and len(sizes) > 1:

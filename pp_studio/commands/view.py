@@ -41,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"address to listen on (default {LOOPBACK}: this machine only)",
     )
     add("--open", action="store_true", help="open the page in the default browser")
-    shared.add_fast(parser)
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
@@ -60,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     folder = run.path
     is_scene = folder.is_dir() and not run.config.exists()
     if is_scene:
-        shared.refuse(options, ("scene", "fast"), "only of a run")
+        shared.refuse(options, ("scene",), "only of a run")
         scene_splits(folder)
     else:
         stored_config(run, scene)
@@ -79,7 +78,7 @@ def run(options: argparse.Namespace) -> None:
             view = ScenePage(server, folder, options.device)
         else:
             dev = open_device(options.device)
-            view = RunView(server, dev, run, scene, is_fast=options.fast)
+            view = RunView(server, dev, run, scene)
         print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
         if options.open:
             open_browser(address)

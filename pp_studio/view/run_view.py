@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from pp_cl import OnStep, RunFolder, Training, fastest, load
+from pp_cl import OnStep, RunFolder, Training, load
 from pp_cl.engine import Device
 from pp_cl.errors import UserError
 from pp_studio.view.model_page import ModelPage, announce
@@ -21,7 +21,6 @@ RENEWED = 1.0  # seconds until a resting tab shows the training's model again
 class RunView:
     """Serves a run folder that another process may still train into. page: None until there is a
     checkpoint; told: a line on the page about what is wrong. scene: where the run's scene is now.
-    is_fast: show the run with the settings of fastest().
     """
 
     def __init__(
@@ -30,13 +29,10 @@ class RunView:
         dev: Device,
         folder: RunFolder,
         scene: str | None = None,
-        *,
-        is_fast: bool = False,
     ) -> None:
         self.page: ModelPage | None = None
         self.told = server.gui.add_markdown("")
         self._server, self._dev, self._folder, self._scene = server, dev, folder, scene
-        self._is_fast = is_fast
         self._seen: dict[Any, Any] = {}  # {file: what changes when it is replaced or grows}
         announce(server, f"reading {folder}")
 
@@ -73,12 +69,7 @@ class RunView:
             return self._seen[path] != before
 
     def _take(self, run):
-        line = ""
-        if self._is_fast:
-            if not self.page:
-                announce(self._server, "measuring once which setting is fastest")
-            run, line = fastest(run)
-        self.told.content = line
+        self.told.content = ""
         if self.page:
             self.page.take(run)
             return

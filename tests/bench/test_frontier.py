@@ -7,13 +7,11 @@ import pytest
 from support.refused import failure
 from support.runs import train_and_interrupt
 
-from pp_cl import fastest
 from pp_cl.bench import frontier
-from pp_cl.bench.frontier import Renderings, fastest_row, frame, measured, visibility
+from pp_cl.bench.frontier import Renderings, frame, visibility
 from pp_cl.bench.plots import plot_frontier
 from pp_cl.cli import main
 from pp_cl.engine.raster.fragments import list_fragments
-from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate_run
 from pp_cl.run import load
 
@@ -35,16 +33,6 @@ def run(whole, dev, tmp_path):
     return load(shutil.copytree(whole[0], tmp_path / "run"), dev)
 
 
-@pytest.fixture
-def unmeasured(monkeypatch):
-    """Makes the test fail if anything is measured again."""
-
-    def fail(_run):
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(frontier, "measured", fail)
-
-
 def of_knob(result, knob):
     rows = [row for row in result["rows"] if row["knob"] in (knob, "default")]
     return sorted(rows, key=lambda row: row["setting"][knob])
@@ -61,7 +49,6 @@ def test_each_setting_has_a_row(whole, dev, tmp_path):
     (default,) = (row for row in rows if row["is_default"])
     mean = evaluate_run(load(folder, dev), out=tmp_path / "eval")["mean"]
     assert {name: default[name] for name in mean} == pytest.approx(mean)
-    assert sum(row["is_fast"] for row in rows) == 1
     assert {row["knob"] for row in rows} >= {"early_stop", "samples", "points", "convolutions"}
     for row in (row for row in rows if row["knob"] == "convolutions"):
         assert row["max_err"] == pytest.approx(default["max_err"], abs=1e-5)
@@ -81,12 +68,6 @@ def test_the_table_names_default_and_frontier(whole, capsys):
         assert text.startswith(row["words"]) and f"{row['psnr']:.2f}" in text
         assert ("the default" in text) == row["is_default"]
         assert ("frontier" in text) == row["is_frontier"]
-        assert ("--fast" in text) == row["is_fast"]
-
-
-def row(ms, psnr, early_stop=0.01, least=None, **more):
-    fields = {"ms": ms, "ms_range": [least or ms - 1, ms + 1], "psnr": psnr, "is_default": False}
-    return fields | {"setting": {"early_stop": early_stop, "samples": 4}} | more
 
 
 def test_a_frame_is_what_the_run_shows_to_a_camera_nearby(run):
@@ -94,15 +75,6 @@ def test_a_frame_is_what_the_run_shows_to_a_camera_nearby(run):
     far = run.cameras()[0]
     near = replace(far, pose=far.pose * [1, 1, 1, 0.5])
     np.testing.assert_array_equal(frame(run, near), run.render(near).colour)
-
-
-def test_the_fastest_row_is_hardly_worse_than_the_default():
-    default = row(10.0, 30.0, is_default=True)
-    fast, worse, slower = row(6.0, 29.91), row(3.0, 29.89), row(8.0, 30.5)
-    assert fastest_row([slower, default, worse, fast]) is fast
-    assert fastest_row([row(9.2, 30.0), default, worse]) is default  # 9.2 ms are too small a gain
-    by_chance = row(5.0, 30.0, early_stop=0.0), row(6.0, 30.0, least=9.0)
-    assert fastest_row([*by_chance, default]) is default
 
 
 def curve(axes, label):
@@ -120,43 +92,6 @@ def test_a_curve_for_each_knob_goes_through_the_default(whole, tmp_path):
     front = sorted([row["ms"], row["psnr"]] for row in rows if row["is_frontier"])
     assert curve(right, "frontier") == front
     assert curve(left, "early stop")[0] == [stops[0][0], pytest.approx(4e-6)]  # 0 has no logarithm
-
-
-def test_what_is_fastest_is_kept_until_the_checkpoint_changes(run, dev, unmeasured):
-    file = run.folder.frontier
-    kept = json.loads(file.read_text())
-    # mark the row with half of the points as the fastest, whichever it was
-    chosen = next(row for row in kept["rows"] if row["setting"]["points"] == 0.5)
-    for row in kept["rows"]:
-        row["is_fast"] = row is chosen
-    file.write_text(json.dumps(kept))
-    fast, line = fastest(run)
-    assert "50% of the points" in line and f"{chosen['psnr']:.2f} dB" in line
-    assert fast.model.cloud.count == round(0.5 * run.model.cloud.count)
-    for damaged in ("", "{", json.dumps(kept | {"key": "a"}), json.dumps(kept | {"rows": []})):
-        file.write_text(damaged)
-        with pytest.raises(AssertionError, match="measured again"):
-            fastest(run)
-    chosen["setting"]["points"] = -3
-    file.write_text(json.dumps(kept))
-    with pytest.raises(AssertionError, match="measured again"):
-        fastest(run)
-    chosen["setting"]["points"] = 0.5
-    file.write_text(json.dumps(kept))
-    fastest(run)
-    words = ["--out", str(run.folder), "--set", "train.iterations=64"]
-    assert main(["train", run.config.scene.path, *words]) == 0
-    with pytest.raises(AssertionError, match="measured again"):
-        fastest(load(run.folder.path, dev))
-
-
-def test_a_run_that_is_fastest_as_it_is_says_so(run, unmeasured):
-    kept = json.loads(run.folder.frontier.read_text())
-    for row in kept["rows"]:
-        row["is_fast"] = row["is_default"]
-    run.folder.frontier.write_text(json.dumps(kept))
-    fast, line = fastest(run)
-    assert fast is run and "no setting is 1.1 times as fast as the default" in line
 
 
 def test_each_setting_changes_what_it_says(run, dev):
@@ -196,11 +131,3 @@ def test_only_finished_runs_are_measured(scene, tmp_path, monkeypatch):
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
     message = f"{tmp_path / 'run'}: is at step 20 of 60; finish it first with `pp-cl train --out"
     assert message in failure("bench", tmp_path / "run")
-    assert message in failure("render", tmp_path / "run", "--fast")
-
-
-def test_a_file_of_the_users_is_not_replaced(run):
-    run.folder.frontier.write_text("mine")
-    with pytest.raises(UserError, match=r"frontier\.json: pp-cl did not write this"):
-        measured(run)
-    assert run.folder.frontier.read_text() == "mine"

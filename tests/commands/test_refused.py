@@ -107,7 +107,6 @@ REFUSED = [
     ("bench run --size 64", "--size: bench a run"),
     ("bench convv", "did you mean conv"),
     ("bench BALL", "config.json"),
-    ("view BALL --fast", "--fast: only of a run"),
     ("export run other --format html", "other"),
     ("export run other --format gallery", "other"),
     ("export run --format html --min-weight 1", "--min-weight"),

@@ -6,7 +6,10 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.config import load_config, run_config
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session.decide import as_decided
+from pp_cl.scene.hull import spacing_pixels
+from pp_cl.scene.load import open_scene
+from pp_cl.scene.verdict import judged
+from pp_cl.session.decide import COARSEST, FINEST, TWICE, as_decided, first_hull
 from pp_cl.session.training import open_training
 
 
@@ -21,6 +24,22 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
     words = ["train", scene, "--out", out, "--points", str(points), "--iterations", "1"]
     assert spoken(words)[0] == 0
     assert load_config(out / "config.json").raster.radius == radius
+
+
+@pytest.mark.parametrize(
+    "key, value, times",
+    [("train.minutes", 1e-3 * TWICE, 1), ("train.minutes", 1e3 * TWICE, 2), ("train.seed", 1, 2)],
+)
+def test_a_second_refinement_is_planned_where_it_will_pay(dev, tmp_path, key, value, times):
+    """With one, points begin as much closer."""
+    scene = write_ball_scene(tmp_path / "ball", views=8, size=192)
+    given = [("points.count", 600, "test"), ("scene.downscale", 1, "test"), (key, value, "test")]
+    config = run_config(RunFolder(tmp_path / "a"), scene, "tiny", given)
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    hull, shares = first_hull(dev, config, judged(dev, config, views)[0])
+    spacing = spacing_pixels(hull.grid, [view.camera for view in views]) / 2**times
+    assert sum(0 < share < 1 for share in shares) == times
+    assert 0.9 * FINEST < spacing < 1.1 * COARSEST
 
 
 @pytest.mark.parametrize("wrong, opacity", [(0, "on"), (4, "off")])

@@ -103,7 +103,7 @@ def anchors(page: Path) -> set[str]:
 def test_named_settings_exist(path):
     known = {key.partition(".")[0]: vars(section) for key, section, _ in every_setting(Config())}
     words = re.findall(rf"\b({'|'.join(known)})\.(\w+)\b(?!\.)", path.read_text("utf-8"))
-    files = {"py", "cl", "md", "json", "h"}
+    files = {"py", "cl", "md", "json", "h", "txt"}
     assert not [w for w in words if w[1] not in known[w[0]] and w[1] not in files]
 
 

@@ -171,17 +171,3 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     distance = 4.0  # from the cameras to the ball's centre
     assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
-
-
-def test_fast_renders_what_is_fastest(trained, tmp_path, monkeypatch, capsys):
-    def thinned(run):
-        return run.varied(rows=np.arange(5, dtype=np.uint32)), "--fast: five points"
-
-    monkeypatch.setattr("pp_cl.fastest", thinned)
-    words = ["render", trained, "--path", "test", "--out"]
-    assert main([*words, str(tmp_path / "few"), "--fast"]) == 0
-    assert "--fast: five points" in capsys.readouterr().out
-    assert main([*words, str(tmp_path / "all")]) == 0
-    few, whole = (read_rgba(tmp_path / name / "00000.png").astype(int) for name in ("few", "all"))
-    assert np.abs(few - whole).max() > 50
-    assert "holds frames of another model" in failure(*words, tmp_path / "few")

@@ -84,16 +84,6 @@ def test_switches_change_what_is_drawn(view, served):
             opened.image(check)
 
 
-def test_fast_shows_what_is_fastest(served, dev, copied, monkeypatch):
-    def thinned(run):
-        return run.varied(rows=np.arange(5, dtype=np.uint32)), "--fast: five points"
-
-    monkeypatch.setattr("pp_studio.view.run_view.fastest", thinned)
-    view = RunView(served[0], dev, RunFolder(copied), is_fast=True)
-    view.look()
-    assert view.page.run.model.cloud.count == 5 and view.told.content == "--fast: five points"
-
-
 def test_the_image_is_saved_as_it_is(view, served):
     with looking(view, served[1]) as opened, drawing(view.page):
         opened.set("Save image", True)
