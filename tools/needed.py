@@ -12,7 +12,7 @@ import sys
 import numpy as np
 
 from pp_cl import Run, load
-from pp_cl.engine.layers.tiles import SIDE
+from pp_cl.engine.layers.tiles import MAP_TILE
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.scene.verdict import judged
@@ -41,11 +41,11 @@ def tiles(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """
     result = run.renderer.forward(run.cameras("train")[0], run.gamma)
     image = np.clip(run.dev.download(result.image), 0, 1)
-    computed = np.ones([side // SIDE for side in result.size], bool)
+    computed = np.ones([side // MAP_TILE for side in result.size], bool)
     if result.tile_mask is not None:
         plan = run.model.net.plan_tiles(result.size, result.tile_mask.get())
         computed = [*plan.maps.values()][-1].computed if plan else computed
-    return image, computed.repeat(SIDE, 0).repeat(SIDE, 1)
+    return image, computed.repeat(MAP_TILE, 0).repeat(MAP_TILE, 1)
 
 
 def draw(run: Run, path: str) -> None:

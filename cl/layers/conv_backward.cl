@@ -61,7 +61,7 @@ kernel void conv_backward(
             if (row < 0 || row >= height) continue;
             global const float *pixel = (second ? x2 + c0 - c1 : x + c0) + (size_t)row * width * c;
             global const float *grad = grad_out + (size_t)y * width * co + block * 16;
-            global const float *count = tile_count + y / SIDE * tile_columns(width);
+            global const float *count = tile_count + y / MAP_TILE * tile_columns(width);
             float16 window[KERNEL_SIZE];  // window[kx]: dL/dout at column + PAD - kx
             UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
                 window[kx] = 0.0f;
@@ -76,11 +76,11 @@ kernel void conv_backward(
                         window[kx] = window[kx - 1];
                     const int ahead = column + PAD;
                     window[0] = ahead < width
-                                    ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
+                                    ? counted(grad + ahead * co, count[ahead / MAP_TILE], lanes)
                                     : (float16)0.0f;
                     // pixels that no counted gradient sees may hold anything
-                    if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
-                        count[min(column + PAD, width - 1) / SIDE] == 0.0f)
+                    if (count[max(column - PAD, 0) / MAP_TILE] == 0.0f &&
+                        count[min(column + PAD, width - 1) / MAP_TILE] == 0.0f)
                         continue;
                     UNROLLED_FOR (int i = 0; i < CI_GROUP; i++) {
                         const float value = pixel[column * c + i];

@@ -12,7 +12,7 @@
 #define ITEMS 256  // of a work-group, at least 2 * QUADS
 #endif
 #define ROWS 2  // lines of a work-item: with all 4 of a tile Intel's threads become narrow
-#define GROUP_TILES (ITEMS * ROWS / (QUADS * SIDE))
+#define GROUP_TILES (ITEMS * ROWS / (QUADS * MAP_TILE))
 #define CHUNK (KERNEL_SIZE == 3 ? 4 : 8)  // input channels at a time
 // Floats from line to line of a tile's values, each aligned to 4; and from tile to tile: 20 more
 // than a multiple of 32, so that the lines of 8 tiles lie in different banks of local memory.
@@ -73,7 +73,7 @@ ALWAYS_INLINE void stage(
 // acc += convolution of x at the work-item's lines. weight: of x's first channel; ci: channels of
 // the weights.
 ALWAYS_INLINE void convolve(
-    float4 acc[ROWS * SIDE],
+    float4 acc[ROWS * MAP_TILE],
     local float *values,
     local float4 *weights,
     local const int2 *corner,
@@ -108,8 +108,8 @@ ALWAYS_INLINE void convolve(
                     const float v[SPAN] = {a.x, a.y, a.z, a.w};
 #endif
                     UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
-                        UNROLLED_FOR (int p = 0; p < SIDE; p++)
-                            acc[row * SIDE + p] += v[p + kx] * w[kx * QUADS];
+                        UNROLLED_FOR (int p = 0; p < MAP_TILE; p++)
+                            acc[row * MAP_TILE + p] += v[p + kx] * w[kx * QUADS];
                 }
             }
     }
@@ -154,8 +154,8 @@ kernel void conv_local(
     const bool second = group >= groups_of_out;
     const int channel = ((second ? group - groups_of_out : group) * QUADS + item_quad()) * 4;
     const int co = second ? co2 : co1;
-    float4 acc[ROWS * SIDE];
-    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
+    float4 acc[ROWS * MAP_TILE];
+    UNROLLED_FOR (int p = 0; p < ROWS * MAP_TILE; p++)
         acc[p] = forward ? bias[channel / 4] : (float4)(0.0f);
     global const float4 *w = weight + group * QUADS * TAPS * ci;
     for (int source = 0; source < (c2 ? 2 : 1); source++)
@@ -165,8 +165,8 @@ kernel void conv_local(
 
     if (channel >= co || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
-    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++) {
-        const int px = at.x + p % SIDE, py = at.y + p / SIDE;
+    UNROLLED_FOR (int p = 0; p < ROWS * MAP_TILE; p++) {
+        const int px = at.x + p % MAP_TILE, py = at.y + p / MAP_TILE;
         if (px >= width || py >= height) continue;
         const size_t to = ((size_t)py * width + px) * co + channel;
         float4 value = acc[p];

@@ -37,10 +37,11 @@ ALWAYS_INLINE void stage(
                         (int2)(pixel % SPAN - PAD, pixel / SPAN - PAD);
         values[i] = pixel4(x, at.x, at.y, c0 + quad * 4, c, height, width);
     }
-    for (int i = item; i < STAGE * SIDE * SIDE * QUADS; i += ITEMS) {
-        const int quad = i % QUADS, pixel = i / QUADS % (SIDE * SIDE),
-                  t = first + i / (QUADS * SIDE * SIDE), tile = tile_list[3 + min(t, end - 1)];
-        const int2 at = tile_corner(tile, width) + (int2)(pixel % SIDE, pixel / SIDE);
+    for (int i = item; i < STAGE * MAP_TILE * MAP_TILE * QUADS; i += ITEMS) {
+        const int quad = i % QUADS, pixel = i / QUADS % (MAP_TILE * MAP_TILE),
+                  t = first + i / (QUADS * MAP_TILE * MAP_TILE),
+                  tile = tile_list[3 + min(t, end - 1)];
+        const int2 at = tile_corner(tile, width) + (int2)(pixel % MAP_TILE, pixel / MAP_TILE);
         grads[i] = t < end ? tile_count[tile] *
                                  pixel4(grad_out, at.x, at.y, o0 + quad * 4, co, height, width)
                            : (float4)(0.0f);
@@ -65,7 +66,7 @@ kernel void conv_local_backward_weights(
     global float4 *partial)  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*(c1+c2)+1, 16) of each part
 {
     local float4 values[STAGE * SPAN * SPAN * CI_QUADS];
-    local float4 grads[STAGE * SIDE * SIDE * QUADS];
+    local float4 grads[STAGE * MAP_TILE * MAP_TILE * QUADS];
     const int item = get_local_id(0), lane = item % CI_QUADS, quad = item / CI_QUADS % QUADS,
               ky = item / (CI_QUADS * QUADS);
     const int group = get_global_id(0) / ITEMS, groups = (c1 + CI_QUADS * 4 - 1) / (CI_QUADS * 4);
@@ -99,18 +100,18 @@ kernel void conv_local_backward_weights(
 #else
 #pragma unroll 2
 #endif
-                for (int row = 0; row < SIDE; row++) {
+                for (int row = 0; row < MAP_TILE; row++) {
                     local const float4 *seen =
                         values + (tile * SPAN + row + ky) * SPAN * CI_QUADS + lane;
-                    float4 g[SIDE];
-                    UNROLLED_FOR (int p = 0; p < SIDE; p++)
-                        g[p] = grads[((tile * SIDE + row) * SIDE + p) * QUADS + quad];
+                    float4 g[MAP_TILE];
+                    UNROLLED_FOR (int p = 0; p < MAP_TILE; p++)
+                        g[p] = grads[((tile * MAP_TILE + row) * MAP_TILE + p) * QUADS + quad];
                     if (with_bias) of_bias += (g[0] + g[1]) + (g[2] + g[3]);
                     UNROLLED_FOR (int column = 0; column < SPAN; column++) {
                         const float4 v = seen[column * CI_QUADS];
                         UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++) {
                             const int p = column - kx;
-                            if (p >= 0 && p < SIDE) {
+                            if (p >= 0 && p < MAP_TILE) {
                                 acc[kx][0] += v.x * g[p];
                                 acc[kx][1] += v.y * g[p];
                                 acc[kx][2] += v.z * g[p];

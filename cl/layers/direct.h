@@ -72,7 +72,7 @@ ALWAYS_INLINE void convolve(
 static inline bool
 any_is_computed(global const float *tile_count, const int x0, const int y, const int width) {
     bool any = false;
-    for (int x = x0; x < x0 + PIXELS + SIDE - 1; x += SIDE)
+    for (int x = x0; x < x0 + PIXELS + MAP_TILE - 1; x += MAP_TILE)
         any |= tile_is_computed(tile_count, min(x, x0 + PIXELS - 1), y, width);
     return any;
 }

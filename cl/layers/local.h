@@ -17,7 +17,7 @@
 #endif
 #define TAPS (KERNEL_SIZE * KERNEL_SIZE)
 #define PAD (KERNEL_SIZE / 2)
-#define SPAN (SIDE + KERNEL_SIZE - 1)  // side of what a tile of outputs sees
+#define SPAN (MAP_TILE + KERNEL_SIZE - 1)  // side of what a tile of outputs sees
 
 // The 4 values at p, of which `count` exist: all where the channels are multiples of 4.
 #if ALIGNED

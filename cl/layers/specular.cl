@@ -56,7 +56,7 @@ ALWAYS_INLINE void dense(
 kernel void specular_forward(
     const uint n,  // pixels
     const uint width,
-    const float side,                   // camera pixels along a side of an image pixel
+    const float supersampling,          // camera pixels along a side of an image pixel
     const float extent,                 // world units of 1 in places
     global const float *camera,         // (21) camera.h
     global const float *transmittance,  // (n)
@@ -89,7 +89,7 @@ kernel void specular_forward(
             const uint pixel = first + min(lane, count - 1);
             for (int c = 0; c < CHANNELS; c++)
                 ((KEPT float *)(inputs + PLACE(c)))[lane] = features[(size_t)CHANNELS * pixel + c];
-            const float3 d = direction_of(&cam, pixel % width, pixel / width, side);
+            const float3 d = direction_of(&cam, pixel % width, pixel / width, supersampling);
             ((float *)direction)[lane] = d.x;
             ((float *)(direction + 1))[lane] = d.y;
             ((float *)(direction + 2))[lane] = d.z;

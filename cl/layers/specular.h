@@ -28,11 +28,12 @@
         }                                                                                          \
     }
 
-// Unit vector, in world axes, from the eye to the centre of a pixel. side: camera pixels along a
-// side of an image pixel.
-static inline float3 direction_of(const Camera *cam, const uint x, const uint y, const float side) {
-    const float across = (side * (x + 0.5f) - cam->cx) / cam->fx;
-    const float down = (side * (y + 0.5f) - cam->cy) / cam->fy;
+// Unit vector, in world axes, from the eye to the centre of a pixel. supersampling: camera pixels
+// along a side of an image pixel.
+static inline float3
+direction_of(const Camera *cam, const uint x, const uint y, const float supersampling) {
+    const float across = (supersampling * (x + 0.5f) - cam->cx) / cam->fx;
+    const float down = (supersampling * (y + 0.5f) - cam->cy) / cam->fy;
     return normalize(across * cam->right + down * cam->down + cam->forward);
 }
 

@@ -14,10 +14,10 @@ kernel void tiles_find(
 {
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
     if (tile >= columns * rows) return;
-    const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE;
-    const int values = min(SIDE, w - x0) * c;  // of one line of the tile
+    const int x0 = tile % columns * MAP_TILE, y0 = tile / columns * MAP_TILE;
+    const int values = min(MAP_TILE, w - x0) * c;  // of one line of the tile
     int other = 0;
-    for (int y = y0; y < min(y0 + SIDE, h); y++) {
+    for (int y = y0; y < min(y0 + MAP_TILE, h); y++) {
         global const float *line = x + ((size_t)y * w + x0) * c;
         for (int i = 0; i < values; i++)
             other |= line[i] != background;
@@ -37,12 +37,13 @@ kernel void tiles_copy(
 {
     const int first = get_global_id(0) * LANES, pixel = get_global_id(1), i = get_global_id(2),
               columns = tile_columns(w);
-    if (first >= c || pixel >= SIDE * SIDE || i >= n) return;
+    if (first >= c || pixel >= MAP_TILE * MAP_TILE || i >= n) return;
     const int from = from_to[i].x, to = from_to[i].y;
-    const int column = to % columns * SIDE + pixel % SIDE, row = to / columns * SIDE + pixel / SIDE;
+    const int column = to % columns * MAP_TILE + pixel % MAP_TILE,
+              row = to / columns * MAP_TILE + pixel / MAP_TILE;
     if (column >= w || row >= h) return;
-    const size_t read =
-        (size_t)(from / columns * SIDE + pixel / SIDE) * w + from % columns * SIDE + pixel % SIDE;
+    const size_t read = (size_t)(from / columns * MAP_TILE + pixel / MAP_TILE) * w +
+                        from % columns * MAP_TILE + pixel % MAP_TILE;
     store_lanes(
         load_lanes(x + read * c + first, c - first), x + ((size_t)row * w + column) * c + first,
         c - first);

@@ -24,7 +24,7 @@
 #define TOGETHER 8
 #endif
 
-#define WINO_M SIDE          // side of a tile of outputs
+#define WINO_M MAP_TILE      // side of a tile of outputs
 #define WINO_S (WINO_M + 2)  // side of a tile of inputs
 #define POSITIONS (WINO_S * WINO_S)
 

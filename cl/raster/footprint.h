@@ -31,11 +31,11 @@
 #endif
 
 // Samples of a pixel, each way: the camera's pixels are the samples, boxes are of pixels.
-#ifndef SIDE
-#define SIDE 1
+#ifndef SUPERSAMPLING
+#define SUPERSAMPLING 1
 #endif
-#define SAMPLES (SIDE * SIDE)
-#define TILE_SIDE (16 / SIDE)  // pixels along a tile, tiles.h
+#define SAMPLES (SUPERSAMPLING * SUPERSAMPLING)
+#define TILE_SIDE (16 / SUPERSAMPLING)  // pixels along a tile, tiles.h
 
 // The least of 1 - alpha, so that what lies behind an opaque fragment is known when gradients are
 // computed; far below what an image shows.

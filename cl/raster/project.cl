@@ -120,8 +120,10 @@ ALWAYS_INLINE uint project_vertices(
     LANES_INTO(words[3], LANED(as_uint)(f.t));
     LANES_INTO(words[4], LANED(as_uint)(f.size));
     LANES_INTO(words[5], LANED(as_uint)(seen));
-    LANES_INTO(words[6], LANED(as_uint)(f.first[0] / SIDE | f.first[1] / SIDE << 16));
-    LANES_INTO(words[7], LANED(as_uint)(f.last[0] / SIDE | f.last[1] / SIDE << 16));
+    LANES_INTO(
+        words[6], LANED(as_uint)(f.first[0] / SUPERSAMPLING | f.first[1] / SUPERSAMPLING << 16));
+    LANES_INTO(
+        words[7], LANED(as_uint)(f.last[0] / SUPERSAMPLING | f.last[1] / SUPERSAMPLING << 16));
 #if RECORD > 8
     for (uint k = 0; k < 3; k++)
         LANES_INTO(words[8 + k], LANED(as_uint)(f.W[k]));

@@ -18,11 +18,11 @@
 
 #define BLOCKS 16  // of a tile
 #define TILE_SAMPLES (16 * BLOCKS)
-#define BLOCK_SIDE (4 / SIDE)  // pixels
+#define BLOCK_SIDE (4 / SUPERSAMPLING)  // pixels
 // Pixels of a block; sample s of pixel k is in lane BLOCK_PIXELS s + k.
 #define BLOCK_PIXELS (16 / SAMPLES)
 // Parts of 4 x 4 pixels, which are the network's tiles (layers/tiles.h), along a tile.
-#define COVERED (4 / SIDE)
+#define COVERED (4 / SUPERSAMPLING)
 
 // The first pixel of a block in its tile. In their Z-order, four neighbours follow one another.
 #define BLOCK_X(b) (BLOCK_SIDE * (int)(((b) & 1) | ((b) >> 1 & 2)))
@@ -42,8 +42,8 @@ typedef struct {
 ALWAYS_INLINE Tile tile_load(global const float *camera, const uint number) {
     Tile tile;
     tile.cam = camera_load(camera);
-    tile.width = tile.cam.width / SIDE;
-    tile.height = tile.cam.height / SIDE;
+    tile.width = tile.cam.width / SUPERSAMPLING;
+    tile.height = tile.cam.height / SUPERSAMPLING;
     const uint columns = (tile.width + TILE_SIDE - 1) / TILE_SIDE;
     tile.x = number % columns * TILE_SIDE;
     tile.y = number / columns * TILE_SIDE;
@@ -160,16 +160,18 @@ ALWAYS_INLINE uint tile_rays(const Tile *tile, Rays rays[OWN_BLOCKS], ints insid
     const uints pixel = SAMPLE % BLOCK_PIXELS, sample = SAMPLE / BLOCK_PIXELS;
     const ints x = LANED(convert_int)(pixel % BLOCK_SIDE),
                y = LANED(convert_int)(pixel / BLOCK_SIDE);
-    const floats dx = LANED(convert_float)(SIDE * x + LANED(convert_int)(sample % SIDE));
-    const floats dy = LANED(convert_float)(SIDE * y + LANED(convert_int)(sample / SIDE));
+    const floats dx =
+        LANED(convert_float)(SUPERSAMPLING * x + LANED(convert_int)(sample % SUPERSAMPLING));
+    const floats dy =
+        LANED(convert_float)(SUPERSAMPLING * y + LANED(convert_int)(sample / SUPERSAMPLING));
     uint blocks = 0;
     for (uint own = 0; own < OWN_BLOCKS; own++) {
         const int x0 = tile->x + BLOCK_X(BLOCK(own)), y0 = tile->y + BLOCK_Y(BLOCK(own));
         inside[own] = x0 + x < tile->width & y0 + y < tile->height;
         if (any_sample(inside[own])) blocks |= 1u << BLOCK(own);
         Rays *m = rays + own;
-        m->x = (dx + (float)(SIDE * x0) + (0.5f - cam->cx)) * per_fx;
-        m->y = (dy + (float)(SIDE * y0) + (0.5f - cam->cy)) * per_fy;
+        m->x = (dx + (float)(SUPERSAMPLING * x0) + (0.5f - cam->cx)) * per_fx;
+        m->y = (dy + (float)(SUPERSAMPLING * y0) + (0.5f - cam->cy)) * per_fy;
         m->length2 = FMA(m->x, m->x, FMA(m->y, m->y, 1.0f));
         m->per_length = 1.0f / sqrt(m->length2);
 #if FOOTPRINT == GAUSSIAN

@@ -9,8 +9,8 @@
 #include "camera.h"
 #include "common.h"
 
-#ifndef SIDE
-#define SIDE 1  // samples of a pixel along each axis
+#ifndef SUPERSAMPLING
+#define SUPERSAMPLING 1  // samples of a pixel along each axis
 #endif
 #define OPAQUE 0.9f  // the least alpha of a pixel with a surface
 #define S2 4.0f      // S = 2 voxels
@@ -28,9 +28,9 @@ kernel void pixel_surface(
     const uint q = get_global_id(0);
     if (q >= hw) return;
     const Camera cam = camera_load(camera);
-    const uint width = cam.width / SIDE;
-    const float x = (SIDE * (q % width + 0.5f) - cam.cx) / cam.fx;
-    const float y = (SIDE * (q / width + 0.5f) - cam.cy) / cam.fy;
+    const uint width = cam.width / SUPERSAMPLING;
+    const float x = (SUPERSAMPLING * (q % width + 0.5f) - cam.cx) / cam.fx;
+    const float y = (SUPERSAMPLING * (q / width + 0.5f) - cam.cy) / cam.fy;
     const float axis = 1.0f / sqrt(x * x + y * y + 1.0f);
     const float alpha = 1.0f - transmittance[q], per_voxel = axis / voxel_size;
     const float range = mean_range[q];

@@ -13,7 +13,7 @@ kernel void specular_rows(
     const uint target_width,
     const uint left,  // of the target's corner in the image
     const uint top,
-    const float side,                   // camera pixels along a side of an image pixel
+    const float supersampling,          // camera pixels along a side of an image pixel
     const float extent,                 // world units of 1 in places
     global const uint *chosen,          // (m) pixels of the image
     global const float *camera,         // (21) camera.h
@@ -31,7 +31,7 @@ kernel void specular_rows(
     global half *row = rows + ROW * ((size_t)first + i);
     for (int c = 0; c < CHANNELS; c++)
         vstore_half(features[(size_t)CHANNELS * pixel + c], c, row);
-    const float3 direction = direction_of(&cam, x, y, side);
+    const float3 direction = direction_of(&cam, x, y, supersampling);
     vstore_half3(direction, 0, row + CHANNELS);
     const float3 place = place_of(&cam, direction, mean_range[pixel], extent);
     vstore_half3(place, 0, row + CHANNELS + 3);

@@ -76,11 +76,11 @@ def view_table(
     includes the buffers of record_weights(), training those of backward(). supersampling: as in
     RenderResult.
     """
-    records, side = until == "weights", supersampling
-    (rows, columns), kind = tiles_of(size, side), (settings.blend, settings.footprint)
+    records = until == "weights"
+    (rows, columns), kind = tiles_of(size, supersampling), (settings.blend, settings.footprint)
     table = projection_table(n, settings.footprint)
-    table |= pairs_table(dev, n, size, pairs, side, by_point=training or records)
-    table |= weights_table(n, size, settings.blend, side, derivatives=training)
+    table |= pairs_table(dev, n, size, pairs, supersampling, by_point=training or records)
+    table |= weights_table(n, size, settings.blend, supersampling, derivatives=training)
     table["features"] = (*size, 16), np.float32
     if records:
         return table | recording_table(pairs)
@@ -129,7 +129,7 @@ class RenderResult:
         """
         return {
             "width": self.size[1],
-            "side": float(self.supersampling),
+            "supersampling": float(self.supersampling),
             "extent": extent,
             "camera": self.points.camera_buffer,
             "transmittance": self.transmittance,
@@ -226,9 +226,9 @@ class Renderer:
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         margin = self.margin if until == "image" and not training else 0
         padded, left, top = camera.padded(net.multiple, margin)
-        size, side = (padded.height, padded.width), 1
-        if until == "image" and is_supersampled(self.settings):
-            side = supersampling or self.supersampling
+        size = padded.height, padded.width
+        is_finer = until == "image" and is_supersampled(self.settings)
+        supersampling = (supersampling or self.supersampling) if is_finer else 1
         if max(size) > MOST_SIDE:
             raise UserError(
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
@@ -240,7 +240,7 @@ class Renderer:
             self.release()
         b = self._buffers
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
-        of_samples = padded.enlarged(side) if side > 1 else padded
+        of_samples = padded.enlarged(supersampling) if supersampling > 1 else padded
         dev.send(b.camera_buffer, self.model.packed(of_samples, depth_range))
         with dev.stage("project"):
             points = project_grid(
@@ -253,13 +253,13 @@ class Renderer:
                 cloud_offset=cloud.offset,
                 opacity=cloud.opacity,
                 radius=self.point_radius,
-                side=side,
+                supersampling=supersampling,
             )
         is_planned = net.is_planned(size)
         options = gamma, early_stop, training, by_pair, times_seen
         pairs, weights, tile_mask = self._pairs_and_weights(points, size, is_planned, *options)
         view = camera, (left, top), size
-        result = RenderResult(dev, *view, points, pairs, weights, tile_mask, side)
+        result = RenderResult(dev, *view, points, pairs, weights, tile_mask, supersampling)
         if until == "weights":
             return result
         with dev.stage("shade"):

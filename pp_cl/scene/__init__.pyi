@@ -3,7 +3,6 @@ from .edits import EDITS as EDITS
 from .edits import Edits as Edits
 from .edits import read_edits as read_edits
 from .edits import write_edits as write_edits
-from .found import MASK_FOLDERS as MASK_FOLDERS
 from .gaze import looked_at as looked_at
 from .gaze import up_of as up_of
 from .hull import Hull as Hull
@@ -21,6 +20,7 @@ from .listing import scene_splits as scene_splits
 from .load import Scene as Scene
 from .load import load_scene as load_scene
 from .load import open_scene as open_scene
+from .lookup import MASK_FOLDERS as MASK_FOLDERS
 from .masks import cut_out as cut_out
 from .masks import named_mask as named_mask
 from .masks import read_mask_of_size as read_mask_of_size

@@ -9,15 +9,15 @@ import numpy as np
 
 from pp_cl.errors import quoted
 from pp_cl.files.atomic import told, write_json
+from pp_cl.scene.conventions import WORDS
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
-from pp_cl.scene.readings import WORDS
 
 EDITS = "pp_cl.json"
 
 
 class Edits(NamedTuple):
     """box: (2, 3) lower and upper corner in world units. dropped: names of images, as the scene
-    lists them. axes: how to read its cameras: one or more of readings.WORDS.
+    lists them. axes: how to read its cameras: one or more of conventions.WORDS.
     """
 
     box: np.ndarray | None = None

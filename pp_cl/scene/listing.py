@@ -18,8 +18,10 @@ import numpy as np
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, one_line, pasted
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.scene import demo
+from pp_cl.scene.conventions import STATED, read_as
 from pp_cl.scene.edits import EDITS, Edits, read_edits
-from pp_cl.scene.found import (
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import (
     IGNORE_FOLDERS,
     MASK_FOLDERS,
     LeftOut,
@@ -30,11 +32,9 @@ from pp_cl.scene.found import (
     scene_near,
     usable,
 )
-from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.masks import OPAQUE, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import SPLITS
-from pp_cl.scene.readings import STATED, read_as
 from pp_cl.settings import Config, SceneConfig
 
 DEMO = "demo"  # the word that names the scene that pp-cl makes itself
@@ -42,7 +42,7 @@ DEMO = "demo"  # the word that names the scene that pp-cl makes itself
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, read_split(folder, split, left_out) lists a split's images as ImageFile without
 # reading pixels and adds the views that cannot be used to left_out. STATES is the format's kind of
-# matrices, one of readings.MATRICES, and their axes, opengl or opencv. Some modules also have
+# matrices, one of conventions.MATRICES, and their axes, opengl or opencv. Some modules also have
 # splits(folder), the names of the splits, and box(folder), the box that the files state around the
 # object. The first module that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)

@@ -17,7 +17,6 @@ from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import exif_turns, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
-from pp_cl.scene.found import LeftOut
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
 from pp_cl.scene.listing import (
@@ -30,6 +29,7 @@ from pp_cl.scene.listing import (
     tell,
     with_masks,
 )
+from pp_cl.scene.lookup import LeftOut
 from pp_cl.scene.masks import (
     AS_GIVEN,
     OPAQUE,

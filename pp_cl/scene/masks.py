@@ -13,7 +13,7 @@ from skimage.morphology import dilation, erosion
 from pp_cl.engine.views import MASK_THRESHOLD, border
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import read_mask, same_shape
-from pp_cl.scene.found import find_mask
+from pp_cl.scene.lookup import find_mask
 from pp_cl.settings import SceneConfig
 
 BORDER_SHARE = 0.5  # share of the border's pixels that must have its median colour

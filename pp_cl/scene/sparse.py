@@ -9,7 +9,7 @@ from plyfile import PlyData
 
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import opened_regular, refusal
-from pp_cl.scene.found import find_image
+from pp_cl.scene.lookup import find_image
 from pp_cl.scene.readers import colmap, transforms
 from pp_cl.scene.readers.common import MOST, fail_at, numbers, read_json
 

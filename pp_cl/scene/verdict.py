@@ -14,6 +14,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names
+from pp_cl.scene.conventions import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.gaze import ahead, meeting, upward
 from pp_cl.scene.hull import (
@@ -26,7 +27,6 @@ from pp_cl.scene.hull import (
 )
 from pp_cl.scene.image_file import ImageFile, shrink
 from pp_cl.scene.listing import DEMO, find_reader, list_split, scene_box, scene_splits
-from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.settings import Config
 
 # The mean share of a mask beside the hull is 0 to 0.016 in sound scenes, and 0.13 and more with

@@ -506,7 +506,7 @@ def _depth_loss(dev, rng):
             large = tuple(side * pixels for pixels in size)
             shared = {"rule": "alpha", "early_stop": stop}
             fine = Blended(dev, rng, n, radius=0.6, size=large, **shared)
-            scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, side=side)
+            scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, supersampling=side)
             scene.blend(fine.opacity, 0.1, fine.point_features, **shared)
             view = scene.projected, scene.weights, scene.shape
             gradient = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=3.0)
@@ -529,7 +529,7 @@ def _samples(dev, rng):
         of_samples = {"rule": "alpha", "early_stop": stop}
         fine = Blended(dev, rng, n, kind=kind, radius=radius, **of_samples)
         view = dev, fine.camera, fine.positions, fine.radius
-        scene = PairedPoints(*view, kind=kind, side=2)
+        scene = PairedPoints(*view, kind=kind, supersampling=2)
         image = scene.blend(fine.opacity, 0.1, fine.point_features, **of_samples)
         expected = dense.features(fine.blend, fine.point_features)
         yield relative(image, _means(expected, scene.shape), WEIGHT["alpha"])

@@ -259,8 +259,8 @@ def _copied_tiles(dev, rng, x):
     """Half of the tiles become copies of the first one of their shape."""
     rows, columns = tiles.grid_shape(*x.shape[:2])
     y, z = np.mgrid[: x.shape[0], : x.shape[1]]
-    cut = (np.arange(rows) * tiles.SIDE + tiles.SIDE > len(x))[:, None] * 2
-    cut = cut + (np.arange(columns) * tiles.SIDE + tiles.SIDE > x.shape[1])
+    cut = (np.arange(rows) * tiles.MAP_TILE + tiles.MAP_TILE > len(x))[:, None] * 2
+    cut = cut + (np.arange(columns) * tiles.MAP_TILE + tiles.MAP_TILE > x.shape[1])
     _, first, kind = np.unique(cut, return_index=True, return_inverse=True)
     source = first[kind.reshape(cut.shape)]
     number = np.arange(rows * columns).reshape(cut.shape)
@@ -268,9 +268,10 @@ def _copied_tiles(dev, rng, x):
     copies, array = tiles.copy_list(source, chosen), dev.upload(x)
     behind = np.full((3, 2), 2**30, np.int32)  # must not be read
     tiles.tiles_copy(dev, array, dev.upload(np.concatenate([copies, behind])), len(copies))
-    tile = np.where(chosen, source, number)[y // tiles.SIDE, z // tiles.SIDE]
+    tile = np.where(chosen, source, number)[y // tiles.MAP_TILE, z // tiles.MAP_TILE]
     expected = x[
-        tile // columns * tiles.SIDE + y % tiles.SIDE, tile % columns * tiles.SIDE + z % tiles.SIDE
+        tile // columns * tiles.MAP_TILE + y % tiles.MAP_TILE,
+        tile % columns * tiles.MAP_TILE + z % tiles.MAP_TILE,
     ]
     return exact(array.get(), expected)
 

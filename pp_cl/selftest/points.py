@@ -66,7 +66,7 @@ def find_all_pairs(
 
 class PairedPoints:
     """Points (N, 3) with one radius or (N,), projected and paired with the tiles of a camera's
-    image, or of one of pixels with side x side samples. exact(): dense.geometry() of them.
+    image, or of one of pixels with several samples. exact(): dense.geometry() of them.
     """
 
     weights: BlendWeights  # from the last blend()
@@ -81,7 +81,7 @@ class PairedPoints:
         *,
         kind: str = "soft",
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
-        side: int = 1,
+        supersampling: int = 1,
     ):
         n, largest = len(positions), float(np.max(radius))
         exact = partial(dense.geometry, camera, positions, kind=kind, depth_range=depth_range)
@@ -102,18 +102,18 @@ class PairedPoints:
         grid = Grid((0.0, 0.0, 0.0), float(size), (1, 1, 1))
         ids = np.zeros(n, np.uint32)
         view = depth_range, grid, ids, offset, largest
-        self._set(dev, camera, kind, side, exact, *view)
+        self._set(dev, camera, kind, supersampling, exact, *view)
 
-    def _set(self, dev, camera, kind, side, exact, depth_range, grid, ids, offset, radius):
+    def _set(self, dev, camera, kind, supersampling, exact, depth_range, grid, ids, offset, radius):
         self.dev, self.camera, self.n, self.buffers = dev, camera, len(ids), Buffers(dev)
         self.exact, self.depth_range = exact, depth_range
-        self.shape = camera.height // side, camera.width // side
+        self.shape = camera.height // supersampling, camera.width // supersampling
         self._view = kind, dev.upload(camera.packed(depth_range)), dev.upload(grid.packed())
         self._points = {
             "point_id": dev.upload(ids, np.uint32),
             "cloud_offset": dev.upload(offset, np.float32),
             "radius": radius,
-            "side": side,
+            "supersampling": supersampling,
         }
         self._project(np.zeros(self.n))
         self.times_seen = dev.zeros((self.n,))

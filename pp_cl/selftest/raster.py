@@ -385,7 +385,9 @@ def _depth_of_samples(dev, rng):
     """2 x 2 samples give the mean depth of those within a voxel of the nearest."""
     for n, kind, stop in ((257, "soft", 0.0), (257, "soft", 1e-2), (33, "disc", 0.0)):
         fine = Blended(dev, rng, n, radius=0.4, rule="alpha", early_stop=stop, kind=kind)
-        scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, kind=kind, side=2)
+        scene = PairedPoints(
+            dev, fine.camera, fine.positions, fine.radius, kind=kind, supersampling=2
+        )
         scene.blend(fine.opacity, 0.1, fine.point_features, rule="alpha", early_stop=stop)
         alpha, *depths = (_fours(array, scene.shape) for array in _depths(dev, fine.scene))
         alpha_and_depths = _depths(dev, scene, 0.3)

@@ -16,10 +16,10 @@ from support.scenes import ring_cameras
 from pp_cl.config import configure, preset
 from pp_cl.engine.views import View
 from pp_cl.files.image import ORIENTATION, read_rgba, write_png
+from pp_cl.scene.conventions import read_as
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import open_scene
 from pp_cl.scene.readers.frame import GL_FROM_CV
-from pp_cl.scene.readings import read_as
 from pp_cl.scene.verdict import MOST_BESIDE, WrongCameras, judged
 from tools.convert_scene import convert
 

@@ -126,3 +126,14 @@ def test_docker_gets_all_that_is_installed(tmp_path):
     expected |= {"LICENSE", "README.md", "pyproject.toml", "setup.cfg", "setup.py"}
     shutil.rmtree(tmp_path / "pp_cl.egg-info")
     assert expected <= packed(tmp_path, tmp_path)
+
+
+# {folder: words that meant several things; docs/glossary.md has those that took their places}
+GONE = {"cl": r"\bSIDE\b", "pp_cl/engine/raster": r"\bside\b", "pp_cl/scene": r"\bscene\.found\b"}
+
+
+@pytest.mark.parametrize("folder", GONE)
+def test_words_that_meant_several_things_do_not_come_back(folder):
+    files = [path for path in (ROOT / folder).rglob("*") if path.suffix in (".cl", ".h", ".py")]
+    assert files
+    assert not [str(f) for f in files if re.search(GONE[folder], f.read_text("utf-8"))]

@@ -1,11 +1,11 @@
 """Tiles of feature maps that a kernel computes."""
 
-from pp_cl.engine.layers.tiles import SIDE, grid_shape
+from pp_cl.engine.layers.tiles import MAP_TILE, grid_shape
 
 
 def pixels_of(tile_mask, height, width):
     """Expand an array of tiles, (rows, columns), to pixels, (height, width)."""
-    return tile_mask.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
+    return tile_mask.repeat(MAP_TILE, 0).repeat(MAP_TILE, 1)[:height, :width]
 
 
 def random_counts(rng, height, width):

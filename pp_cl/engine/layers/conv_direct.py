@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Program
 from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
-from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
+from pp_cl.engine.layers.tiles import MAP_TILE, VECTOR, Tiles
 
 # Image rows that one work-item sums for the gradient of the weights: few enough to stay in a core's
 # cache, and to give all cores a part.
@@ -28,7 +28,7 @@ def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, til
         "conv_forward",
         size,
         conv.blocking.work_group,
-        multiply_adds=tiles.number * SIDE**2 * shape.products,
+        multiply_adds=tiles.number * MAP_TILE**2 * shape.products,
         along=1,
         height=shape.size[0],
         width=shape.size[1],

@@ -10,7 +10,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Program
 from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
-from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles, grid_shape
+from pp_cl.engine.layers.tiles import MAP_TILE, VECTOR, Tiles, grid_shape
 
 QUAD = 4  # channels of a work-item
 # Work-items of a tile: each computes two lines of it, ROWS in cl/layers/conv_local.cl.
@@ -60,13 +60,13 @@ def backward(
         "conv_local_backward_weights",
         (groups * items, -(-co // (QUAD * in_group)), parts),
         (items, 1, 1),
-        multiply_adds=tiles.number * SIDE**2 * shape.products,
+        multiply_adds=tiles.number * MAP_TILE**2 * shape.products,
         along=2,
         c1=shape.sources[0],
         c2=sum(shape.sources[1:]),
         co=co,
         run=run,
-        summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
+        summed=max(1, min(SUMMED, width // (2 * MAP_TILE * MAP_TILE))),
         x=sources[0],
         x2=sources[-1],
         grad_out=grad_out,
@@ -108,7 +108,7 @@ def _launch(conv, inputs, channels, xs, results, mask_arrays, masks, relu, tiles
         "conv_local",
         (groups * items, sum(-(-c // (QUAD * in_group)) for c in channels)),
         (items, 1),
-        multiply_adds=tiles.number * SIDE**2 * conv.shape.products,
+        multiply_adds=tiles.number * MAP_TILE**2 * conv.shape.products,
         c1=inputs[0],
         c2=sum(inputs[1:]),
         co1=channels[0],

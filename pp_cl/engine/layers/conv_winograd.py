@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from pyopencl.array import Array
 
 from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits
-from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
+from pp_cl.engine.layers.tiles import MAP_TILE, VECTOR, Tiles
 
-POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
+POSITIONS = (MAP_TILE + 2) ** 2  # values of a transformed tile
 # Weights are narrow if input channels times output channels are at most this: transformed they take
 # 2.25 MiB, about a core's L2 cache, and reading them for fewer tiles at a time costs little.
 NARROW = 128 * 128

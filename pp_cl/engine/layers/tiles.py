@@ -17,7 +17,7 @@ from pp_cl.engine.device.launch import channel_ranges, lanes
 
 VECTOR = 16  # channels in one float16
 # pixels: F(4x4, 3x3) outputs this many, and the network's two halvings make one pixel of them
-SIDE = 4
+MAP_TILE = 4
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Tiles:
 
 def grid_shape(height: int, width: int) -> tuple[int, int]:
     """(rows, columns) of the tiles of a feature map."""
-    return -(-height // SIDE), -(-width // SIDE)
+    return -(-height // MAP_TILE), -(-width // MAP_TILE)
 
 
 def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
@@ -85,8 +85,8 @@ def tiles_find(
 def tiles_with(pixels: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: the tiles in which any of the pixels (H, W) bool is set."""
     (height, width), (rows, columns) = pixels.shape, grid_shape(*pixels.shape)
-    whole = np.pad(pixels, ((0, rows * SIDE - height), (0, columns * SIDE - width)))
-    return np.logical_or.reduce(whole.reshape(rows, SIDE, columns, SIDE), (1, 3))
+    whole = np.pad(pixels, ((0, rows * MAP_TILE - height), (0, columns * MAP_TILE - width)))
+    return np.logical_or.reduce(whole.reshape(rows, MAP_TILE, columns, MAP_TILE), (1, 3))
 
 
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
     see copy_list(); no tile is both read and written. A tile and its source have the same shape.
     """
     h, w, c = x.shape
-    size, work_group = channel_ranges(dev, n, SIDE * SIDE, c)
+    size, work_group = channel_ranges(dev, n, MAP_TILE * MAP_TILE, c)
     _program(dev).launch("tiles_copy", size, work_group, h=h, w=w, c=c, n=n, from_to=from_to, x=x)
 
 

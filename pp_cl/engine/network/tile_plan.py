@@ -26,7 +26,7 @@ from scipy.ndimage import distance_transform_cdt
 from pp_cl.engine.device.buffers import PackedArrays
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.tiles import (
-    SIDE,
+    MAP_TILE,
     Tiles,
     all_tiles,
     copy_list,
@@ -92,7 +92,7 @@ def tiles_in_reach(found: np.ndarray, size: tuple[int, int], offset: tuple[int, 
 
 def _tiles_of(pixels):
     """How many tiles a number of pixels reaches."""
-    return -(-pixels // SIDE)
+    return -(-pixels // MAP_TILE)
 
 
 def receptive_radius(layers: list[Layer]) -> dict[str, int]:
@@ -180,7 +180,7 @@ def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int
     equal tiles. border: a tile may depend on its distance from the border of the image if it is
     within this many tiles of level 0.
     """
-    rows, columns = (_classes(length, level, border * SIDE) for length in size)
+    rows, columns = (_classes(length, level, border * MAP_TILE) for length in size)
     classes = (rows[:, None] * (columns.max() + 1) + columns).ravel()
     numbers = np.arange(active.size)
     idle, source = np.flatnonzero(~active), numbers.copy()
@@ -193,7 +193,7 @@ def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int
 
 def _classes(length, level, border):
     """Classes of the tiles along one axis of the image: each tile near a border has its own."""
-    side = SIDE << level
+    side = MAP_TILE << level
     start = np.arange(0, length, side)
     near = (start < border) | (start + side > length - border)
     return np.where(near, np.arange(len(start)), len(start))

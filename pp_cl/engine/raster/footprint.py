@@ -34,13 +34,13 @@ FOOTPRINTS = {
 }
 
 
-def footprint_macros(footprint: str, side: int = 1) -> dict[str, int | str]:
-    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS and side
-    x side samples in a pixel.
+def footprint_macros(footprint: str, supersampling: int = 1) -> dict[str, int | str]:
+    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS.
+    supersampling: samples of a pixel, each way.
     """
     kind = FOOTPRINTS[footprint]
     return {
-        "SIDE": side,
+        "SUPERSAMPLING": supersampling,
         "FOOTPRINT": footprint.upper(),
         "OFFSETS": kind.offsets,
         "RECORD": kind.record,

@@ -69,12 +69,17 @@ class Pairs:
 
 
 def pairs_table(
-    dev: Device, n: int, size: tuple[int, int], pairs: int, side: int = 1, by_point: bool = False
+    dev: Device,
+    n: int,
+    size: tuple[int, int],
+    pairs: int,
+    supersampling: int = 1,
+    by_point: bool = False,
 ) -> Table:
-    """The buffers for n points, an image of size (height, width) and a capacity of pairs. side: see
-    ProjectedPoints. by_point: with point_offset.
+    """The buffers for n points, an image of size (height, width) and a capacity of pairs.
+    supersampling: see ProjectedPoints. by_point: with point_offset.
     """
-    rows, columns = tiles_of(size, side)
+    rows, columns = tiles_of(size, supersampling)
     tiles = rows * columns
     table: Table = {
         "tile_next": ((_chunks(dev, tiles) if dev.is_cpu else 1, tiles), np.uint32),
@@ -111,8 +116,8 @@ def find_pairs(
     times_seen: (N,) float32, counts for each point the images in which its box lies. by_point: also
     number the pairs by point.
     """
-    n, tiles = len(points.point_count), tiles_of(size, points.side)
-    b.require(pairs_table(dev, n, size, capacity, points.side, by_point))
+    n, tiles = len(points.point_count), tiles_of(size, points.supersampling)
+    b.require(pairs_table(dev, n, size, capacity, points.supersampling, by_point))
     macros = {"LANES": lanes(dev), "BLOCK": BLOCK, **points.macros()}
     program = dev.program("raster/pairs", **macros)
     count = tiles[0] * tiles[1]
@@ -180,7 +185,7 @@ def launch_tiles(
     describes. arguments: by parameter name, apart from those that all of them have; defines: macros
     of the program.
     """
-    samples, tiles = points.side**2, pairs.tiles[0] * pairs.tiles[1]
+    samples, tiles = points.supersampling**2, pairs.tiles[0] * pairs.tiles[1]
     defines = {"LANES": lanes(dev, samples), **points.macros(), **arguments.pop("defines", {})}
     launch_groups(
         dev,

@@ -28,8 +28,8 @@ class ProjectedPoints:
     (ceil(N/BLOCK),) uint32, the sums of point_count over blocks of BLOCK points. point_record: (N,
     8) uint32, (N, 16) for Gaussians, what cl/raster/footprint.h keeps of a point, its place in
     camera axes, shape, opacity from the eye and box; undefined where point_count is 0.
-    cloud_offset, radius: the arguments of project_grid(). side: samples of a pixel, each way; boxes
-    are in pixels, the camera is in samples.
+    cloud_offset, radius: the arguments of project_grid(). supersampling: samples of a pixel, each
+    way; boxes are in pixels, the camera is in samples.
     """
 
     footprint: str
@@ -39,23 +39,25 @@ class ProjectedPoints:
     block_sum: Array
     cloud_offset: Array
     radius: float
-    side: int = 1
+    supersampling: int = 1
 
     def macros(self) -> dict[str, int | str]:
         """footprint_macros() of these points."""
-        return footprint_macros(self.footprint, self.side)
+        return footprint_macros(self.footprint, self.supersampling)
 
 
-def tiles_of(size: tuple[int, int], side: int = 1) -> tuple[int, int]:
-    """(rows, columns) of the tiles of an image (height, width) with side x side samples a pixel."""
-    return -(-size[0] * side // TILE), -(-size[1] * side // TILE)
-
-
-def touched_tiles(radius: float, side: int = 1) -> float:
-    """The approximate number of tiles that the box of a point touches, with side x side samples in
-    each pixel. radius: of the footprint, in pixels.
+def tiles_of(size: tuple[int, int], supersampling: int = 1) -> tuple[int, int]:
+    """(rows, columns) of the tiles of an image (height, width). supersampling: samples of a pixel,
+    each way.
     """
-    samples = 2 * max(LEAST_RADIUS, radius * side)  # along its box
+    return -(-size[0] * supersampling // TILE), -(-size[1] * supersampling // TILE)
+
+
+def touched_tiles(radius: float, supersampling: int = 1) -> float:
+    """The approximate number of tiles that the box of a point touches. radius: of the footprint, in
+    pixels. supersampling: samples of a pixel, each way.
+    """
+    samples = 2 * max(LEAST_RADIUS, radius * supersampling)  # along its box
     return (1 + samples / TILE) ** 2
 
 
@@ -80,10 +82,10 @@ def project_grid(
     cloud_offset: Array,
     opacity: Array,
     radius: float,
-    side: int = 1,
+    supersampling: int = 1,
 ) -> ProjectedPoints:
-    """Project the points, each in the cell of a grid vertex, into a camera. If a pixel has side x
-    side samples, the camera's pixels are the samples.
+    """Project the points, each in the cell of a grid vertex, into a camera. If a pixel has several
+    samples, the camera's pixels are the samples.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
     PointCloud.offset; (N, 16) for Gaussians. opacity: (N, 9) float32, PointCloud.opacity. radius:
@@ -91,7 +93,11 @@ def project_grid(
     """
     n = point_id.size
     b.require(projection_table(n, footprint))
-    macros = {"BLOCK": BLOCK, "MOST_OFFSET": f"{MOST_OFFSET}f", **footprint_macros(footprint, side)}
+    macros = {
+        "BLOCK": BLOCK,
+        "MOST_OFFSET": f"{MOST_OFFSET}f",
+        **footprint_macros(footprint, supersampling),
+    }
     launch_groups(
         dev,
         "raster/project",
@@ -110,4 +116,4 @@ def project_grid(
         block_sum=b.block_sum,
     )
     arrays = b.point_record, b.point_count, b.block_sum, cloud_offset
-    return ProjectedPoints(footprint, camera_buffer, *arrays, radius, side)
+    return ProjectedPoints(footprint, camera_buffer, *arrays, radius, supersampling)

@@ -96,12 +96,12 @@ class BlendWeights:
 
 
 def weights_table(
-    n: int, size: tuple[int, int], blend: str, side: int = 1, *, derivatives: bool
+    n: int, size: tuple[int, int], blend: str, supersampling: int = 1, *, derivatives: bool
 ) -> Table:
-    """The buffers for n points and an image of size (height, width) with side x side samples a
-    pixel.
+    """The buffers for n points and an image of size (height, width). supersampling:
+    samples of a pixel, each way.
     """
-    (rows, columns), pixels = tiles_of(size, side), size[0] * size[1]
+    (rows, columns), pixels = tiles_of(size, supersampling), size[0] * size[1]
     samples = rows * columns * TILE_SAMPLES // 16, 16
     table: Table = {
         "tile_shown": ((rows * columns,), np.uint32),
@@ -144,7 +144,7 @@ def blend_weights(
     read_count() downloads the number of visible points.
     """
     n, is_alpha = len(points.point_count), blend == "alpha"
-    b.require(weights_table(n, pairs.size, blend, points.side, derivatives=derivatives))
+    b.require(weights_table(n, pairs.size, blend, points.supersampling, derivatives=derivatives))
     dev.fill(b.point_is_visible, 0)
     keeps = derivatives or not is_alpha
     state, end = (b.sample_state, b.sample_end) if keeps else (None, None)

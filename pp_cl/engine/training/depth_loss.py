@@ -32,7 +32,7 @@ def depth_gradient(
     """
     pixels = size[0] * size[1]
     b.require(depth_loss_table(pixels))
-    program = dev.program("training/depth_loss", SIDE=points.side)
+    program = dev.program("training/depth_loss", SUPERSAMPLING=points.supersampling)
     program.launch(
         "pixel_surface",
         pixels,

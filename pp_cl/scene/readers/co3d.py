@@ -16,8 +16,8 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
-from pp_cl.scene.found import LeftOut, find_image, usable
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import LeftOut, find_image, usable
 from pp_cl.scene.readers.common import MOST, SPLITS, hold_out, progress, read_json
 from pp_cl.scene.readers.frame import Frame, rigid
 

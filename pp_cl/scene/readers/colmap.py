@@ -21,7 +21,9 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, pasted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import UTF_16, opened_regular, refusal
-from pp_cl.scene.found import (
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lens import LensDistortion
+from pp_cl.scene.lookup import (
     LeftOut,
     find_image,
     folder_named,
@@ -31,8 +33,6 @@ from pp_cl.scene.found import (
     nested,
     usable,
 )
-from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.readers.common import (
     CUT_UP,
     MOST,

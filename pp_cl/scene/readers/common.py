@@ -22,8 +22,8 @@ from pp_cl.files.untrusted import (
     refusal,
 )
 from pp_cl.progress import track
-from pp_cl.scene.found import Fail, LeftOut, natural, numbered, pictures_of, usable
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import Fail, LeftOut, natural, numbered, pictures_of, usable
 
 HELD_OUT = 8  # every eighth image, from the first on, is for test, as in LLFF and 3DGS
 SPLITS = ["test", "train"]  # of a format without splits

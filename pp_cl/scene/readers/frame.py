@@ -11,8 +11,8 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
-from pp_cl.scene.found import Fail, find_image
 from pp_cl.scene.lens import LensDistortion
+from pp_cl.scene.lookup import Fail, find_image
 from pp_cl.scene.readers.common import CUT_UP, MOST, PANORAMIC, numbers
 
 # values of camera_model: perspective lenses, and fisheyes

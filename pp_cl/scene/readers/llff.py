@@ -7,8 +7,8 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.found import LeftOut, folder_images, image_folder
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import LeftOut, folder_images, image_folder
 from pp_cl.scene.readers.common import fail_at, fitted, in_order, read_npy
 from pp_cl.scene.readers.frame import rigid
 

@@ -10,8 +10,8 @@ from scipy.linalg import rq
 
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
-from pp_cl.scene.found import LeftOut, folder_images, image_folder
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import LeftOut, folder_images, image_folder
 from pp_cl.scene.readers.common import fail_at, in_order, read_npz
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"

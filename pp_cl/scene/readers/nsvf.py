@@ -7,8 +7,8 @@ from pathlib import Path
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.found import LeftOut, find_file, folder_images, image_folder, usable
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import LeftOut, find_file, folder_images, image_folder, usable
 from pp_cl.scene.readers.common import fail_at, fitted, read_numbers
 from pp_cl.scene.readers.frame import rigid
 

@@ -16,8 +16,8 @@ from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, same_shape, write_png
 from pp_cl.files.untrusted import opened_regular
-from pp_cl.scene.found import LeftOut, usable
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import LeftOut, usable
 from pp_cl.scene.readers.common import (
     SPLITS,
     checked_box,

@@ -16,7 +16,7 @@ from pp_cl.engine.layers.simple import (
     upsample2_forward,
 )
 from pp_cl.engine.layers.tiles import (
-    SIDE,
+    MAP_TILE,
     VECTOR,
     all_tiles,
     some_tiles,
@@ -74,9 +74,9 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
 @pytest.mark.parametrize(
     "file, name, value",
     [
-        ("layers/tiles.h", "SIDE", SIDE),
+        ("layers/tiles.h", "MAP_TILE", MAP_TILE),
         ("common.h", "CHANNELS", VECTOR),
-        ("layers/conv_local.cl", "ROWS", SIDE // TILE_PARTS),
+        ("layers/conv_local.cl", "ROWS", MAP_TILE // TILE_PARTS),
     ],
 )
 def test_host_and_kernels_agree(file, name, value):

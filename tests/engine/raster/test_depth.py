@@ -29,7 +29,7 @@ def test_soft_points_are_balls(dev, rng):
 @pytest.mark.exact
 @pytest.mark.parametrize("side", [1, 2])
 def test_a_nan_is_not_hidden(dev, side):
-    scene = PairedPoints(dev, make_camera(24, 20), np.zeros((1, 3)), 0.4, side=side)
+    scene = PairedPoints(dev, make_camera(24, 20), np.zeros((1, 3)), 0.4, supersampling=side)
     scene.blend([np.nan], 0.1, np.zeros((1, 16)), rule="alpha")
     covered = scene.listed.pixel
     assert len(covered) > 10

@@ -11,9 +11,9 @@ from support.transforms_scenes import escape, refused
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import write_png
-from pp_cl.scene.found import find_image, find_masks, folder_images, numbered
 from pp_cl.scene.listing import scene_frames
 from pp_cl.scene.load import load_scene
+from pp_cl.scene.lookup import find_image, find_masks, folder_images, numbered
 from pp_cl.scene.readers import common
 from pp_cl.scene.readers.common import (
     fail_at,

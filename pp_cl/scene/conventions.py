@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import exif_turns
-from pp_cl.scene.found import natural
 from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lookup import natural
 
 STATED = "stated"  # the cameras are right as the format defines them
 # {kind of matrix: (whether its rotation is camera-to-world, whether its last column is the centre)}
