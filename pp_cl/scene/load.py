@@ -51,6 +51,7 @@ MEASURED = 12  # views whose masks are tested for soft edges
 # half-transparent share of a mask: 0 at any size if it is sharp, 0.4 if blurred by 5 pixels (sigma)
 SOFT = 0.05
 INVERTED = 0.95  # share of an image's border that hardly any object's mask covers
+LEAST_MASKED = 0.25  # share of the views whose masks give the others one
 OF_OTHERS = "views without a mask are used inside the hull of the others' masks, except for a rim"
 FITS = 1.2  # median factor by which masks must fit turned pictures better
 TURNED = "pictures are turned as their EXIF says, as only then their masks fit"
@@ -236,7 +237,7 @@ def _all_masked(folder, views, dev, left_out):
     """
     bare = [view for view in views if not (view.is_masked or view.has_mask)]
     masked = [view for view in views if view.is_masked or view.has_mask]
-    if bare and dev and len(masked) >= max(LEAST_VIEWS, len(bare) + len(left_out)):
+    if bare and dev and len(masked) >= max(LEAST_VIEWS, LEAST_MASKED * len(views)):
         with suppress(UserError):
             filled = {view.name: view for view in within_silhouettes(dev, masked, bare)}
             views = [filled.get(view.name, view) for view in views]

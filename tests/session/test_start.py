@@ -28,7 +28,7 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
 
 @pytest.mark.parametrize(
     "key, value, times",
-    [("train.minutes", 1e-3 * TWICE, 1), ("train.minutes", 1e3 * TWICE, 2), ("train.seed", 1, 2)],
+    [("train.minutes", 1e-3 * TWICE, 1), ("train.minutes", 40 * TWICE, 2), ("train.seed", 1, 2)],
 )
 def test_a_second_refinement_is_planned_where_it_will_pay(dev, tmp_path, key, value, times):
     """With one, points begin as much closer."""

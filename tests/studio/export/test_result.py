@@ -79,9 +79,11 @@ def test_an_open_page_renews_itself_and_keeps_the_look(begun):
         write_result(folder, "Ball", "video.mp4", **facts | {"state": "", "told": ["the last"]})
         wait(lambda: "the last" in page.evaluate(text))
         time.sleep(1)
+        page.evaluate("1")  # takes note of what was asked until now
         page.asked.clear()
         time.sleep(4)  # one that is done asks for no newer version
-        assert page.evaluate("1") == 1 and not page.asked and not page.wrong
+        page.evaluate("1")
+        assert not page.asked and not page.wrong
 
 
 TOUCH = {"enabled": True, "maxTouchPoints": 2}
