@@ -14,8 +14,8 @@ from pp_cl.engine.views import MASK_THRESHOLD, View, border, evenly
 
 MOST = 1 / 8  # of the views may be wrong, rounded up; more are named, and the scene is refused
 SIDE = 128  # pixels along the longer side of the masks that are compared, about
-# rays through a mask, fewer in scenes of more than MANY views; places on each
-RAYS, PLACES, MANY = 160, 64, 48
+# rays through a mask, fewer in scenes of more than FULL views; places on each
+RAYS, PLACES, FULL = 160, 64, 24
 TOGETHER = 150  # views that are compared with each other at once
 FEWEST = 8  # views among which one can be told to be wrong
 AROUND, WIDER = 0.8, 1.3  # quantile of the objects' radii by view; factor for the searched ball
@@ -32,6 +32,7 @@ MOST_OWN, LEAST_SHOWN = 0.5, 0.5  # a cropped view that looks elsewhere
 # Without masks: least share of the other images that show one place of a view's pyramid;
 # bounds of an eye's distance to where most look, as shares of the usual one.
 GRID, DEPTHS, LEAST_TOGETHER = 7, 16, 0.75
+MANY = 48  # other images, at most
 INSIDE, AT_IT, AWAY = 0.25, 0.08, 6.0
 
 
@@ -122,7 +123,7 @@ def _votes(small):
     No view rejects places of its own.
     """
     rng, n = np.random.default_rng(0), len(small)
-    rays = max(16, RAYS * MANY // max(MANY, n))
+    rays = max(16, RAYS * FULL // max(FULL, n))
     axes, radii, directions = [], [], []
     for view in small:
         rows, columns = np.nonzero(view.strict)

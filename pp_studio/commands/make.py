@@ -43,6 +43,7 @@ LATE = 0.8  # the time per step is measured after this share of a training
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
 MOST_GAUSSIANS = 180_000  # of the splat: a page of them has 9.7 MB
 MARKED = 2**16  # bytes of a checkpoint's end
+RESTS = 16.0  # an open page is renewed at most after so many times the seconds that this takes
 OF_SPLAT = 0.6  # share of the minutes left after the evaluation
 # of a training on photographs: poses are not exact, and surfaces would have pits
 SMOOTH = ["--set", "train.depth_weight=0.001"]
@@ -122,13 +123,20 @@ def run(options: argparse.Namespace) -> None:
             clock.keep()
 
         def follow(training):
+            ended = took = 0.0
+
             def renew():
+                nonlocal ended, took
+                if (began := time.monotonic()) < ended + RESTS * took:
+                    return
                 try:
                     write_preview(training, out, clock.title)
                     show(f"In training, at step {training.trainer.step}.")
                 except (UserError, MemoryError) as error:  # must not end a training
                     warnings.warn(f"{page} is not renewed in the training: {error}", stacklevel=2)
                     training.on_preview = None
+                ended = time.monotonic()
+                took = ended - began
 
             training.on_preview = renew
 

@@ -40,7 +40,7 @@ from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
 from pp_studio.export import BEST, QUALITIES, QUICK
-from pp_studio.export.harmonics import COUNT, fit_harmonics
+from pp_studio.export.harmonics import COUNT, SHARED, cubes, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
 LAYER = "specular."  # its arrays with parameters of the specular layer have names that begin so
@@ -54,7 +54,8 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # viewers leave out Gaussians of less opacity
-FIRST_VIEWS = 16  # views that colour the points before the fit
+# views that colour the points of a preview, and those of a fit in limited minutes
+FIRST_VIEWS, BEGUN_VIEWS = 16, 32
 LOW_PASS = 0.3  # pixels^2 that viewers add to all variances on the screen
 
 # Pixels on the longer side of the smallest window for which splats are made. In smaller ones
@@ -150,8 +151,8 @@ def fit_gaussians(
     sRGB colour as the first three features.
     """
     began = time.monotonic()
-    # the fit does the rest
-    coefficients = fit_harmonics(run, steps=1 if minutes == math.inf else -1)
+    is_quick = minutes < math.inf  # the fit does the rest
+    coefficients = fit_harmonics(run, -1 if is_quick else 1, BEGUN_VIEWS if is_quick else None)
     dev, cloud = run.dev, begun(run, coefficients, cell, most)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
@@ -255,10 +256,12 @@ def _fit_specular(run, gaussians):
 
 def first_gaussians(run: Run) -> Gaussians:
     """Like fitted_gaussians(), but in seconds, without a fit: round, as wide as the points, each
-    with the mean of the colours that the network gives it. Raises UserError as check_drawable does.
+    with the mean of the colours that the network gives it; at most SHARED, of cubes of points if
+    there are more. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    cloud = begun(run, fit_harmonics(run, steps=-1, most=FIRST_VIEWS), 0)
+    cell = float(run.model.cloud.count > SHARED)
+    cloud = begun(run, fit_harmonics(run, steps=-1, most=FIRST_VIEWS), cell, SHARED)
     return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 
@@ -371,12 +374,8 @@ def begun(run: Run, coefficients: np.ndarray, cell: float, most: float = math.in
     vertices = (grid.positions(ids) - grid.origin) / grid.voxel_size
     places, unit = vertices + moved[:, :3], DEVIATION * run.config.raster.radius
     area = (unit * np.exp(moved[:, 3])) ** 2  # area of a round one, in voxel sizes, over 2 pi
-    group = np.arange(len(rows))  # the Gaussian of each point
-    if cell:
-        group = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
-        while group.max() >= most:  # they lie on surfaces
-            cell *= max(1.05, math.sqrt((group.max() + 1) / most))
-            group = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
+    # the Gaussian of each point
+    group = cubes(places, cell, most) if cell else np.arange(len(rows))
     count = group.max() + 1
     weight = area * opacity + 1e-6  # above 0, also for a lone invisible point
     total = np.bincount(group, weight, count)[:, None]

@@ -6,6 +6,7 @@ the colours of the points in the directions from the eye. The coefficients minim
 differences from the run's own renderings of the training views, by conjugate gradients.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,7 @@ COLOURS = slice(3)  # used here of the 16 blended features; the next is 0 in all
 # Ridge on all functions but the constant one, per blend weight: a point that few views show keeps
 # no slopes. On the demo's test views, 0.003 is 0.8 dB better than 0.03.
 RIDGE = 0.003
+SHARED = 150_000  # points, on surfaces, that have colours of their own before any fit
 LEAST = 1e-6  # ridge weight of a point that is never seen: its colour stays 0
 
 
@@ -58,17 +60,48 @@ class Observation:
         return pixels[:, COLOURS] - rest[:, None], rest
 
     def gathered(self, pixels: np.ndarray) -> np.ndarray:
-        """(S, 3) float32: for each point, the sum of the pixels (HW, 3) times its weights there."""
+        """(S, C) float32: for each point, the sum of the pixels (HW, C) times its weights there; C
+        is at most 16.
+        """
+        count = pixels.shape[1]
         features = np.zeros((self.camera.height, self.camera.width, 16), np.float32)
-        features[..., COLOURS] = pixels.reshape(*features.shape[:2], 3)
-        return self.run.renderer.gather(self.view, features)[:, COLOURS]
+        features[..., :count] = pixels.reshape(*features.shape[:2], count)
+        return self.run.renderer.gather(self.view, features)[:, :count]
 
     def functions(self, positions: np.ndarray) -> np.ndarray:
         """(S, 9) float32: basis() of the directions from the eye to the visible points. positions:
         (N, 3), of all points.
         """
-        towards = positions[self.visible] - self.camera.eye
-        return basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+        return _functions(self.camera, positions[self.visible])
+
+
+def _functions(camera, places):
+    """(S, 9) float32: basis() of the directions from the eye to places (S, 3)."""
+    towards = places - camera.eye
+    return basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+
+
+def _summed(groups, values):
+    """((G,) the groups, ascending; (G, C) float32 sums of their rows of values (S, C))."""
+    rows, index = np.unique(groups, return_inverse=True)
+    if len(rows) == len(groups):
+        return rows, values
+    sums = [np.bincount(index, column, len(rows)) for column in values.T]
+    return rows, np.stack(sums, 1).astype(np.float32)
+
+
+def cubes(places: np.ndarray, cell: float, most: float) -> np.ndarray:
+    """(N,) the number of the cube in which each of the places (N, 3) lies. cell: side of the cubes,
+    or a larger one of at most `most` cubes, if the places lie on surfaces.
+    """
+    while True:
+        cube = (places // cell).astype(np.int64)
+        cube -= cube.min(0)
+        key = np.ravel_multi_index(tuple(cube.T), tuple(cube.max(0) + 1))
+        group = np.unique(key, return_inverse=True)[1].ravel()
+        if (count := group.max() + 1) <= most:
+            return group
+        cell *= max(1.05, math.sqrt(count / most))
 
 
 def observe(
@@ -104,19 +137,26 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
     gradients, preconditioned by each point's block of A. Each step recomputes the views' weights,
     since those of all views would fill the memory. steps: -1 applies the preconditioner to b alone:
-    each point gets the weighted mean colour of its pixels.
+    each point gets the weighted mean colour of its pixels, or, of more than SHARED points, of those
+    of all points in its cube.
     """
-    cameras, n = evenly(run.cameras("train"), most), run.model.cloud.count
-    positions = run.model.positions()
+    cameras, positions = evenly(run.cameras("train"), most), run.model.positions()
+    group, n = np.arange(len(positions)), len(positions)
+    if steps < 0 and n > SHARED:
+        group = cubes((positions - run.model.grid.origin) / run.model.grid.voxel_size, 1.0, SHARED)
+        n = group.max() + 1
+        columns = [np.bincount(group, axis, n) for axis in positions.T]
+        positions = np.stack(columns, 1) / np.bincount(group, minlength=n)[:, None]
     b, blocks = np.zeros((n, COUNT, 3), np.float32), np.zeros((n, COUNT, COUNT), np.float32)
     for camera in track(cameras, "colours", "view"):
         rendered = run.render(camera)
         colours = np.float32(rendered.colour - (1 - rendered.alpha)[..., None]).reshape(-1, 3)
         observation = _look(run, camera, blending=True)
-        at, rows = observation.functions(positions), observation.visible
-        weights = observation.gathered(np.ones_like(colours))[:, :1]
-        b[rows] += at[:, :, None] * observation.gathered(colours)[:, None]
-        blocks[rows] += (weights * at)[:, :, None] * at[:, None]
+        sums = observation.gathered(np.column_stack([np.ones(len(colours)), colours]))
+        rows, sums = _summed(group[observation.visible], sums)
+        at = _functions(camera, positions[rows])
+        b[rows] += at[:, :, None] * sums[:, None, 1:]
+        blocks[rows] += (sums[:, :1] * at)[:, :, None] * at[:, None]
         del observation
     ridge = RIDGE * blocks[:, :1, 0] * (np.arange(COUNT) > 0) + LEAST
     diagonal = np.arange(COUNT)
@@ -124,7 +164,7 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     inverse = np.linalg.inv(blocks)
 
     if steps < 0:
-        return (inverse @ b).astype(np.float32)
+        return (inverse @ b).astype(np.float32)[group]
 
     def product(flat):
         coefficients = flat.reshape(b.shape)

@@ -215,6 +215,7 @@ def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
 ):
     scene, renewed, real = runs.ball(views=12, size=32), [], result.write_preview
     monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
+    monkeypatch.setattr(make, "RESTS", 0.0)
     for name in ("out", "alone"):
         folder = tmp_path / name
         begin_result(folder)
