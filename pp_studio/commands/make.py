@@ -34,7 +34,7 @@ Its parts are capture, train, eval, export and render. The same command goes on 
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
 # Evaluation, splat and video, after the training, take this share of the minutes that the capture
 # leaves, within these bounds in minutes.
-AFTER, LEAST_AFTER, MOST_AFTER = 0.2, 1.0, 5.0
+AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
 LEAST_TRAINING = 0.6  # share of the minutes that the capture leaves
 # At least this share of the minutes is left after a capture: training then gets a third of all.
 LEAST_LEFT = 5 / 9
@@ -271,7 +271,7 @@ class _Clock:
         """Print how the minutes are divided before the photographs are read."""
         capture = min(PER_PHOTOGRAPH * _photographs(source), self.minutes)
         print(
-            f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a fifth of the"
+            f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a quarter of the"
             " rest for evaluation, splat and video, and what is left for the training",
             flush=True,
         )
