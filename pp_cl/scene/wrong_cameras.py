@@ -15,7 +15,7 @@ from pp_cl.engine.views import MASK_THRESHOLD, View, border, evenly
 MOST = 1 / 8  # of the views may be wrong, rounded up; more are named, and the scene is refused
 SIDE = 128  # pixels along the longer side of the masks that are compared, about
 # rays through a mask, fewer in scenes of more than FULL views; places on each
-RAYS, PLACES, FULL = 160, 64, 24
+RAYS, PLACES, FULL = 160, 64, 48
 TOGETHER = 150  # views that are compared with each other at once
 FEWEST = 8  # views among which one can be told to be wrong
 AROUND, WIDER = 0.8, 1.3  # quantile of the objects' radii by view; factor for the searched ball

@@ -156,10 +156,10 @@ def test_attempts_that_fail_do_not_count(tmp_path, minutes):
 def test_a_third_of_the_minutes_is_the_trainings(tmp_path, minutes, capsys):
     with make._Clock(tmp_path / "make.json", 9, None) as clock:
         minutes(3)
-        assert clock.training() == pytest.approx(4.8) and clock.left == pytest.approx(6)
+        assert clock.training() == pytest.approx(4.5) and clock.left == pytest.approx(6)
         assert "too long" not in capsys.readouterr().out
         minutes(10)
-        assert clock.training() == pytest.approx(4)
+        assert clock.training() == pytest.approx(3.75)
         assert "9 minutes: 13.0 have passed, which is too long; 18.0 are taken" in (
             capsys.readouterr().out
         )
@@ -296,7 +296,7 @@ class Enough(Exception):
 @pytest.mark.usefixtures("minutes")  # a busy machine takes none of them
 @pytest.mark.parametrize(
     "words, minutes",
-    [([], "16"), (["--minutes", "1.5"], "0.9"), (["--minutes", "60"], "55"), (PRESET, "16")],
+    [([], "15"), (["--minutes", "1.5"], "0.9"), (["--minutes", "60"], "55"), (PRESET, "15")],
 )
 def test_photographs_are_captured_first(tmp_path, monkeypatch, words, minutes):
     steps = []
