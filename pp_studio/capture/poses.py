@@ -255,7 +255,8 @@ def _focal_ratio(model, image):
         by_ratio = (places[:, :2] / z[:, None])[..., None]
         rows = np.concatenate([by_turn, by_place, by_ratio], -1)
         errors = np.linalg.norm(off, axis=1)
-        weights = 1 / np.sqrt(1 + (errors / (2 * np.median(errors))) ** 2)
+        usual = max(np.median(errors), 1e-9)  # 0 where points fit exactly
+        weights = 1 / np.sqrt(1 + (errors / (2 * usual)) ** 2)
         step = np.linalg.lstsq(
             (rows * weights[:, None, None]).reshape(-1, 7),
             (off * weights[:, None]).ravel(),
@@ -263,7 +264,7 @@ def _focal_ratio(model, image):
         )[0]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         rotation, shift, ratio = turn @ rotation, turn @ shift + step[3:6], ratio + step[6]
-    return float(ratio)
+    return float(max(ratio, 1e-3))  # few points may pull it below 0
 
 
 def contradictions(database: Path, model: Any) -> list[tuple[str, str]]:
